@@ -360,10 +360,12 @@ def _git() -> SystemCheck:
 def _warm() -> str:
     """Compile the kernels; return what is wrong, for after the checks, which may say why."""
     try:
+        from ambiguous_wild.methods.refinesplat.multiview import compile_kernels
         from ambiguous_wild.simulate.photo_render import compile_tracer
         from ambiguous_wild.splat.calibration import warm_up
 
         warm_up(lambda line: click.echo(line, err=True), helper=True)
+        compile_kernels()
         compile_tracer()
     except Exception as error:  # whatever a damaged installation raises
         return f"the kernels could not be compiled: {type(error).__name__}: {error}"

@@ -20,6 +20,7 @@ from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig, merged
 from ambiguous_wild.splat.backend import backend_of
+from ambiguous_wild.splat.cpu.compile import torch_threads
 from ambiguous_wild.splat.density import (
     NO_SIZE_PRUNING,
     DensityConfig,
@@ -122,7 +123,9 @@ def _flank_on_kept(
 def _on_kept(points: Tensor, camera: Camera, keep: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return which world points [N, 3] are inside the frame, and which on a kept pixel, [N] bool each."""
     pose = backend_of(points.device).pose(camera, points)
-    local = points @ pose[:3, :3].T + pose[:3, 3]
+    with torch_threads(1):
+        local = points @ pose[:3, :3].T
+    local = local.add_(pose[:3, 3])
     z = local[:, 2].clamp(min=1e-6)
     u = torch.floor((local[:, 0] / z * camera.fx + camera.cx).clamp(-1.0, camera.width)).long()
     v = torch.floor((local[:, 1] / z * camera.fy + camera.cy).clamp(-1.0, camera.height)).long()
@@ -194,7 +197,8 @@ class EntropyAwareDensity(DensityControl):
             self.downhill -= gradients.means
         if self.support.due(step.iteration):
             self.support.match(len(step.gaussians), step.gaussians.device)
-            self.support.look(step.gaussians, step.rendered.visible, step.camera, keep)
+            with torch_threads():
+                self.support.look(step.gaussians, step.rendered.visible, step.camera, keep)
 
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:

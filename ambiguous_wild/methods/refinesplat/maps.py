@@ -16,7 +16,7 @@ from torch import Tensor
 from ambiguous_wild.splat.backend import backend_of
 
 FAR_MORE = 1.5  # ratio of agreeing pixels from which an offset is accepted
-_WHITE = 255.0  # colours are from 0 to 255
+WHITE = 255.0  # colours are from 0 to 255
 
 
 def sized(array: np.ndarray, device: torch.device | str) -> Tensor:
@@ -62,6 +62,12 @@ class MapStack:
         """Return a view's map [channels, h, w] without padding."""
         h, w = self.sizes[view]
         return self.stack[view, :, :h, :w]
+
+    def shares_of_views(self) -> np.ndarray:
+        """Return the share of the stack's width and height that each map covers, [views, 2] float32."""
+        if self.shares is None:
+            return np.ones((len(self.sizes), 2), np.float32)
+        return self.shares.cpu().numpy().reshape(-1, 2)
 
     def select(self, views: Tensor) -> Selected:
         """Copy the maps of views [n] int64."""
@@ -168,7 +174,7 @@ def agree(difference: Tensor, same: Tensor, most: float, offset: Tensor) -> Tens
         offset: [n, 3], from `common_offset`.
     """
     apart = (difference - offset[:, :, None]).abs_().sum(1)
-    return (apart < 3.0 * most * _WHITE) & same
+    return (apart < 3.0 * most * WHITE) & same
 
 
 def common_offset(difference: Tensor, same: Tensor, most: float) -> Tensor:
@@ -186,7 +192,7 @@ def common_offset(difference: Tensor, same: Tensor, most: float) -> Tensor:
     common = median(some)
     apart = torch.stack([some, some - common[..., None]]).abs_().sum(2)  # [2, n, P]
     # comparisons with NaN are false: pixels of other surfaces, and views without any, do not agree
-    as_they_are, shifted = (apart < 3.0 * most * _WHITE).sum(2)
+    as_they_are, shifted = (apart < 3.0 * most * WHITE).sum(2)
     return common.masked_fill((shifted <= FAR_MORE * as_they_are)[:, None], 0.0)
 
 

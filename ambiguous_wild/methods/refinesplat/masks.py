@@ -25,6 +25,7 @@ from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPrior
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence, grown, hysteresis
 from ambiguous_wild.methods.refinesplat.threshold import InstanceStats, Threshold, learnt, pool_of, t_ent
 from ambiguous_wild.splat.backend import backend_of
+from ambiguous_wild.splat.cpu.compile import torch_threads
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.step import Step, TrainData
@@ -251,7 +252,8 @@ class MaskStore:
     def renew(self, step: Step) -> None:
         """Compute the mask of the step's view, store its evidence for other views, and learn w2."""
         view, config = step.view, self.config.mask
-        _, masks = self.examine(step, remember=True)
+        with torch_threads():
+            _, masks = self.examine(step, remember=True)
         self.means[view].copy_(masks.means)
         self.distances[view].copy_(masks.distances)
         if config.w2 is None:

@@ -35,6 +35,8 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.methods.refinesplat.maps import (
+    FAR_MORE,
+    WHITE,
     MapStack,
     Ranks,
     Selected,
@@ -44,7 +46,9 @@ from ambiguous_wild.methods.refinesplat.maps import (
     sized,
 )
 from ambiguous_wild.methods.refinesplat.structure import blur_and_shrink, nearest
+from ambiguous_wild.methods.refinesplat.view_lookup import COLOURS, combine, look_up
 from ambiguous_wild.splat.backend import backend_of
+from ambiguous_wild.splat.cpu.compile import torch_threads
 
 SPREAD = 9  # px, box over a view's evidence before others read it: depth is off by a few pixels
 _BLUR = 5  # px, box over photos before their colours are compared, for the same reason
@@ -91,6 +95,7 @@ class _Query:
     """The constants of one view's queries to its n neighbours."""
 
     neighbours: Tensor  # [n] int64
+    frames: np.ndarray  # [n, 3, 4] float32, the next four as columns
     right: Tensor  # [n, 3, 1, 1] a step along the view's x axis, in the neighbours' frames
     down: Tensor  # along its y axis
     ahead: Tensor  # along its z axis
@@ -172,6 +177,9 @@ class OtherViews:
             for view, camera in enumerate(cameras)
         ]
 
+        if self.count:
+            self.ask(0, torch.zeros(self.sizes[0], device=device))  # compiles the CPU's kernels
+
     def remember(self, view: int, evidence: Tensor, depth: Tensor) -> None:
         """Store the evidence of a view.
 
@@ -181,7 +189,9 @@ class OtherViews:
             depth: [h, w] at half this size, from `halved`.
         """
         rows, columns = self.queries[view].shrink
-        self.stored.put(view, rows @ evidence @ columns, channel=0)
+        with torch_threads(1):
+            small = rows @ evidence @ columns
+        self.stored.put(view, small, channel=0)
         self.depth.put(view, depth)
         self._mark_known(view)
 
@@ -212,6 +222,10 @@ class OtherViews:
         if not self.count:
             return None
         own, config, shape = self.queries[view], self.config, depth.shape
+        # also in the first round: to wait until all neighbours have evidence gave 16.9 dB instead of 18.7
+        least = min(config.seen_by, len(self.stored_views.intersection(self.near[view])))
+        if backend_of(depth.device).kernels:
+            return MultiViewEvidence(*self._ask_kernels(view, depth, least))
         stacks = self.stored, self.depth, self.surface
         points = _NeighbourRays(
             torch.addcmul(torch.addcmul(own.ahead, own.down, own.y), own.right, own.x).flatten(2),
@@ -231,11 +245,31 @@ class OtherViews:
         seen = answers.same.sum(0)
         weight = agreement_weight(seen, answers.agree.sum(0), config.agreeing, few)
         evidence = self.ranks.quantile_of(answers.evidence, seen)
-        # also in the first round: to wait until all neighbours have evidence gave 16.9 dB instead of 18.7
-        least = min(config.seen_by, len(self.stored_views.intersection(self.near[view])))
         coverage = (seen / least).clamp_(max=1.0) if least else torch.ones(seen.shape, device=seen.device)
         maps = (evidence, weight.float(), coverage.float())
         return MultiViewEvidence(*(x.view(shape) for x in maps))
+
+    def _ask_kernels(self, view: int, depth: Tensor, least: int) -> Tensor:
+        """Return evidence, weight and coverage [3, h, w] by the kernels of the CPU."""
+        own, config = self.queries[view], self.config
+        n, (h, w) = self.count, depth.shape
+        stored, depths, surfaces = (s.stack.numpy() for s in (self.stored, self.depth, self.surface))
+        shares, surface_shares = (s.shares_of_views() for s in (self.stored, self.surface))
+        rays = own.frames, own.x.numpy(), own.y.numpy().ravel()
+        near, of = own.neighbours.numpy(), np.float32
+        apart = of(3.0 * config.agree * WHITE)
+        rules = of(config.depth), apart, of(FAR_MORE), of(config.agreeing), config.known_by
+        evidence, same = np.empty((n, h, w), np.float32), np.empty((n, h, w), np.bool_)
+        difference, offset = np.empty((n, h, w, 3), np.float32), np.zeros((n, 3), np.float32)
+        counts, out = np.zeros((n, 3, COLOURS), np.int64), np.empty((3, h, w), np.float32)
+        found = evidence, same, difference, offset
+        look_up(*rays, depth.numpy(), near, view, stored, depths, shares, rules, counts, *found)
+        sparse = np.empty((0, 0), np.float32) if own.sparse_depth is None else own.sparse_depth.numpy()
+        combine(
+            *rays, sparse, near, view, stored, depths, surfaces, shares, surface_shares, rules, least,
+            self.ranks.pair.numpy(), self.ranks.share.numpy(), *found, out,
+        )  # fmt: skip
+        return torch.from_numpy(out)
 
     def _look_up_sparse(
         self, points: _NeighbourRays, depth: Tensor, answers: _Answers, few: Tensor, offset: Tensor | None
@@ -294,6 +328,12 @@ class OtherViews:
         return ((z - surface_z).abs_() < self.config.depth * surface_z) & (z > 0)
 
 
+def compile_kernels() -> None:
+    """Compile the kernels that look up evidence on the CPU."""
+    camera, photo = Camera(2, 2, 1.0, 1.0, 1.0, 1.0, np.eye(4)), np.zeros((2, 2, 3), np.float32)
+    OtherViews([camera] * 2, [photo] * 2, MultiViewConfig(), [], "cpu")
+
+
 def _every_second(x: Tensor, shape: torch.Size) -> Tensor:
     """Take every second row and column of flat maps [..., h w], flat."""
     return x.view(*x.shape[:-1], *shape)[..., ::2, ::2].flatten(-2)
@@ -345,6 +385,7 @@ def _query_of(
             sparse = 1.0 / cv2.resize(inverse, (w, h), interpolation=cv2.INTER_NEAREST)
     return _Query(
         neighbours=torch.from_numpy(np.array(near, np.int64)).to(device),
+        frames=frames.astype(np.float32),
         right=right,
         down=down,
         ahead=ahead,

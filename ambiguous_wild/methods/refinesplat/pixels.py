@@ -49,12 +49,7 @@ def rounds_for(pixels: int) -> int:
 
 
 def components(masks: Tensor, connectivity: int) -> Tensor:
-    """Number the components of masks [n, H, W] bool from 1 on, [n * H * W] int64; 0 = in no mask."""
-    if backend_of(masks.device).kernels:
-        each = [cv2.connectedComponents(m, connectivity=connectivity)[1] for m in masks.byte().numpy()]
-        stack = np.stack(each).astype(np.int64)
-        stack += np.arange(len(stack))[:, None, None] * masks[0].numel() * (stack > 0)
-        return torch.from_numpy(stack.ravel())
+    """Number the components of masks [n, H, W] bool on a GPU, [n * H * W] int64 from 1 on; 0 = in no mask."""
     pixels = masks.numel()
     # pooling needs floating point
     dtype = torch.float32 if pixels < _FLOAT32_EXACT else torch.float64
@@ -85,6 +80,8 @@ def hysteresis(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
     Returns:
         [n, H, W] bool.
     """
+    if backend_of(values.device).kernels:
+        return torch.stack([_reached(weak, strong) for weak, strong in zip(values > low, values > high)])
     labels = components(values > low, 8)
     # a strong pixel is also weak, so it lies in a component; all others write to slot 0
     reached = torch.zeros(labels.numel() + 1, dtype=torch.bool, device=values.device)
@@ -93,10 +90,21 @@ def hysteresis(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return reached[labels].view(values.shape)
 
 
+def _reached(weak: Tensor, strong: Tensor) -> Tensor:
+    count, labels = cv2.connectedComponents(weak.byte().numpy(), connectivity=8)
+    reached = np.zeros(count, bool)
+    reached[labels[strong.numpy()]] = True
+    return torch.from_numpy(reached[labels])
+
+
 def fill_holes(mask: Tensor, share: float) -> Tensor:
     """Fill the enclosed gaps of a mask [H, W] bool that are smaller than `share` of the photo."""
     if share <= 0:
         return mask
+    if backend_of(mask.device).kernels:
+        _, gaps, statistics, _ = cv2.connectedComponentsWithStats((~mask).byte().numpy(), connectivity=4)
+        small = statistics[:, cv2.CC_STAT_AREA] < share * mask.numel()
+        return mask | torch.from_numpy(small[gaps])
     labels = components(~mask[None], 4)
     areas = labels.new_zeros(labels.numel() + 1).scatter_add_(0, labels, torch.ones_like(labels))
     return mask | (areas[labels] < share * mask.numel()).view(mask.shape)

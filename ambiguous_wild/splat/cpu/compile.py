@@ -104,3 +104,23 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         set_threads(before)
+
+
+@contextmanager
+def torch_threads(count: int | None = None) -> Iterator[None]:
+    """Let torch use this many threads inside of the context; None = as many as the kernels.
+
+    Their number decides the last bits of sums and matrix products, but not of what is computed element by
+    element. With Numba's work queue torch would wait for its own threads, so there it keeps one.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    if count is None:
+        count = threads()  # it also starts the layer that is asked for next
+        count = before if numba.threading_layer() == "workqueue" else count
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -158,13 +158,13 @@ class OtherViews:
         self.surface = MapStack([np.zeros_like(blank if s is None else s)[None] for s in sparse], device)
         self.stored_views: set[int] = set()  # views with stored evidence
         # made once for each size, because they take as much memory as the maps
-        shrinks = {
-            (camera.height, camera.width): (
-                sized(blur_and_shrink(camera.height, h, SPREAD), device),
-                sized(blur_and_shrink(camera.width, w, SPREAD).T, device),
-            )
-            for camera, (h, w) in zip(cameras, self.sizes)
-        }
+        shrinks: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
+        for camera, (h, w) in zip(cameras, self.sizes):
+            if (camera.height, camera.width) not in shrinks:
+                shrinks[camera.height, camera.width] = (
+                    sized(blur_and_shrink(camera.height, h, SPREAD), device),
+                    sized(blur_and_shrink(camera.width, w, SPREAD).T, device),
+                )
         self.queries = [
             _query_of(
                 view,

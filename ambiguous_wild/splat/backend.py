@@ -9,6 +9,7 @@ without a GPU: with numbers, by letting `accelerated` say yes to the CPU; and wi
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar
 
 import torch
@@ -112,6 +113,16 @@ class Backend:
         threads()  # starts Numba's pool, which sets the number of OpenMP's threads, torch's with it
         torch.set_num_threads(n)
 
+    def all_threads(self) -> AbstractContextManager[None]:
+        """Let torch use all threads inside of the context, for what has the same bits with any number.
+
+        That is everything element by element or row by row, but not sums over many rows or products of large
+        matrices.
+        """
+        from ambiguous_wild.splat.cpu.compile import torch_threads
+
+        return torch_threads()
+
     # -- what effects and methods need ------------------------------------------------------------
 
     def number(self, value: Tensor) -> float | Tensor:
@@ -205,6 +216,9 @@ class GpuBackend(Backend):
 
     def use_threads(self, n: int) -> None:
         torch.set_num_threads(n)
+
+    def all_threads(self) -> AbstractContextManager[None]:
+        return nullcontext()
 
     def number(self, value: Tensor) -> float | Tensor:
         return value.detach().double()

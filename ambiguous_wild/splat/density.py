@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import State, check_limits
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.gaussians import Gaussians, rotation_matrices
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.step import Step, TrainData
@@ -126,10 +127,11 @@ class DensityControl:
             return
         self._match(step.gaussians)
         scale = self._half(step.camera.width, step.camera.height, gradients.screen.device)
-        visible = step.rendered.visible
-        norms = torch.linalg.vector_norm(self.statistic(gradients) * scale, dim=1)
-        self.grad_sum += torch.where(visible, norms, torch.zeros_like(norms))
-        self.views_seen += visible.to(self.views_seen.dtype)
+        visible, statistic = step.rendered.visible, self.statistic(gradients)
+        with backend_of(visible.device).all_threads():
+            norms = torch.linalg.vector_norm(statistic * scale, dim=1)
+            self.grad_sum += norms.masked_fill_(~visible, 0.0)
+            self.views_seen += visible
 
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:

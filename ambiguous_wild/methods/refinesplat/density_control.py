@@ -20,7 +20,6 @@ from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig, merged
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.splat.cpu.compile import torch_threads
 from ambiguous_wild.splat.density import (
     NO_SIZE_PRUNING,
     DensityConfig,
@@ -123,9 +122,7 @@ def _flank_on_kept(
 def _on_kept(points: Tensor, camera: Camera, keep: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return which world points [N, 3] are inside the frame, and which on a kept pixel, [N] bool each."""
     pose = backend_of(points.device).pose(camera, points)
-    with torch_threads(1):
-        local = points @ pose[:3, :3].T
-    local = local.add_(pose[:3, 3])
+    local = points @ pose[:3, :3].T + pose[:3, 3]
     z = local[:, 2].clamp(min=1e-6)
     u = torch.floor((local[:, 0] / z * camera.fx + camera.cx).clamp(-1.0, camera.width)).long()
     v = torch.floor((local[:, 1] / z * camera.fy + camera.cy).clamp(-1.0, camera.height)).long()
@@ -185,6 +182,8 @@ class EntropyAwareDensity(DensityControl):
     def statistic(self, gradients: Gradients) -> Tensor:
         entropy = gradients.screen_extra
         if entropy is None:  # a step without entropy terms
+            if self.config.decides != "entropy":
+                return gradients.screen
             entropy = torch.zeros_like(gradients.screen)
         if self.config.decides == "total":
             return gradients.screen + entropy
@@ -193,11 +192,11 @@ class EntropyAwareDensity(DensityControl):
     @torch.no_grad()
     def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:
         super().observe(step, gradients, keep)
-        if step.nominal <= self.config.stop:
-            self.downhill -= gradients.means
-        if self.support.due(step.iteration):
-            self.support.match(len(step.gaussians), step.gaussians.device)
-            with torch_threads():
+        with backend_of(step.gaussians.device).all_threads():
+            if step.nominal <= self.config.stop:
+                self.downhill -= gradients.means
+            if self.support.due(step.iteration):
+                self.support.match(len(step.gaussians), step.gaussians.device)
                 self.support.look(step.gaussians, step.rendered.visible, step.camera, keep)
 
     @torch.no_grad()

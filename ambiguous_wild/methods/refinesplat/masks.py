@@ -25,7 +25,6 @@ from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPrior
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence, grown, hysteresis
 from ambiguous_wild.methods.refinesplat.threshold import InstanceStats, Threshold, learnt, pool_of, t_ent
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.splat.cpu.compile import torch_threads
 
 if TYPE_CHECKING:
     from ambiguous_wild.splat.step import Step, TrainData
@@ -252,7 +251,7 @@ class MaskStore:
     def renew(self, step: Step) -> None:
         """Compute the mask of the step's view, store its evidence for other views, and learn w2."""
         view, config = step.view, self.config.mask
-        with torch_threads():
+        with backend_of(self.theta.device).all_threads():
             _, masks = self.examine(step, remember=True)
         self.means[view].copy_(masks.means)
         self.distances[view].copy_(masks.distances)

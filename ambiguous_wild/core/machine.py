@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 MEMORY_SHARE = 0.5  # of the usable memory, for photos that threads hold at a time
 BYTES_A_PIXEL = 40  # of a photo that is read, turned and searched for features
@@ -43,12 +50,30 @@ def usable_memory() -> int | None:
     return min([memory, *(values[0] for values in _limits(MEMORY_LIMITS) if values[0] > 0)])
 
 
-def photo_threads(largest_px: int) -> int:
-    """Return how many threads may read photos of at most this many pixels at a time."""
+def photo_threads(largest_px: int, bytes_a_pixel: int = BYTES_A_PIXEL) -> int:
+    """Return how many threads may work on photos of at most this many pixels at a time."""
     memory = usable_memory()
     if memory is None or largest_px < 1:
         return usable_cores()
-    return max(1, min(usable_cores(), int(MEMORY_SHARE * memory / (BYTES_A_PIXEL * largest_px))))
+    return max(1, min(usable_cores(), int(MEMORY_SHARE * memory / (bytes_a_pixel * largest_px))))
+
+
+def in_order(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
+    """Yield the result of each item in the order of the items, as `map` does, computed on several threads.
+
+    Few results wait until they are taken, so that a long scene does not fill the memory.
+    """
+    if threads <= 1:
+        yield from map(function, items)
+        return
+    begun: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        for item in items:
+            begun.append(pool.submit(function, item))
+            if len(begun) > threads:
+                yield begun.popleft().result()
+        while begun:
+            yield begun.popleft().result()
 
 
 def _limits(names: tuple[str, ...]) -> list[list[int]]:

@@ -12,13 +12,14 @@ import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Required, TypedDict, cast, get_args
 
 import numpy as np
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.machine import in_order, photo_threads
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.methods.entry import resolve
 from ambiguous_wild.methods.references import error_location, hash_of_package, import_file
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 Better = Literal["higher", "lower", None]  # None: not ranked
 _IMAGE = "ambiguous_wild.metrics.image:"
+BYTES_A_CODE = 80  # of a picture, while a metric works on it: ten copies in float64
 _REGION_DB = 1e-2  # larger, because rounding may move a pixel into or out of a region
 MASK_LABELS = {"iou": "IoU", "precision": "precision", "recall": "recall"}
 ALWAYS = ("psnr", "ssim", "lpips_alex")  # shown even where missing: the reason stands below the table
@@ -250,13 +252,20 @@ class ImageRow(TypedDict, total=False):
     psnr: float | None
 
 
+def _value_or_error(metric: Metric, **image: Any) -> float | AwError:
+    try:
+        return metric.value(**image)
+    except AwError as error:
+        return error
+
+
 def measure_images(
     pictures: Iterable[tuple[str, np.ndarray, np.ndarray]],
     metrics: Collection[Metric],
     scene: Scene,
     *,
     half: bool = False,
-    around: Callable[[], AbstractContextManager[None]] = nullcontext,
+    around: Callable[[], AbstractContextManager[int]] = lambda: nullcontext(1),
 ) -> tuple[list[ImageRow], dict[str, str]]:
     """Measure pictures; return their rows, and why metrics are missing: after an AwError, for all images.
 
@@ -265,7 +274,8 @@ def measure_images(
         metrics: what to measure.
         scene: the scene of the test views.
         half: measure the right halves alone.
-        around: context in which each metric is computed.
+        around: context in which the metrics of a picture are computed; it says how many at a time, where the
+            memory allows it.
 
     Raises:
         AwError: a render differs from its photo in size.
@@ -278,15 +288,14 @@ def measure_images(
             raise AwError(f"the render of {name} differs from its photo in size: render at the photo's size")
         left = pair[1].shape[1] // 2 if half else 0
         render, photo = (np.ascontiguousarray(picture[:, left:]) for picture in pair)
-        view = views[name]
+        asked = [metric for metric in metrics if metric.key not in missing]
+        value = partial(_value_or_error, render=render, photo=photo, view=views[name], scene=scene)
+        with around() as threads:
+            values = list(in_order(value, asked, min(threads, photo_threads(photo.size, BYTES_A_CODE))))
         rows.append({"name": name})
-        for metric in metrics:
-            try:
-                with around():
-                    value = math.nan if metric.key in missing else metric.value(render, photo, view, scene)
-            except AwError as error:
-                missing[metric.key] = str(error)
-            else:
-                if not (metric.partial and math.isnan(value)):
-                    rows[-1][metric.key] = value
+        for metric, found in zip(asked, values):
+            if isinstance(found, AwError):
+                missing[metric.key] = str(found)
+            elif not (metric.partial and math.isnan(found)):
+                rows[-1][metric.key] = found
     return [cast(ImageRow, {k: v for k, v in row.items() if k not in missing}) for row in rows], missing

@@ -33,7 +33,7 @@ _GUEST = (8, 9)  # counted in user and nice already
 # The error of one calibration is a tenth, on a busy machine a fifth, so a run needs about 20 of them.
 # Time between two calibrations: SHARE of the training so far, but from MIN_S to EVERY_S.
 MIN_S = 1.0
-SHARE = 1 / 20
+SHARE = 1 / 10
 EVERY_S = 15.0
 OTHERS = 0.1  # a run is contended if others use more than this share of the processors that it needs
 VARIED = 1.3  # or if the machine is this many times slower in one part of the training than in another

@@ -35,14 +35,17 @@ SHOWN = 20_000  # most points of a kind in a picture
 class Recorder:
     """Draw a row of pictures of each chosen view whenever the run passes a moment.
 
-    It is called after every iteration, with the clock stopped. Rows are kept on disk until the end, so that a
-    run that was killed and resumed has all of them; the trainer's state holds none.
+    It is called after every iteration, with the clock stopped. Rows are kept on disk, too, until the end, so
+    that a run that was killed and resumed has all of them; the trainer's state holds none.
     """
 
     def __init__(self, trainer: Trainer, folder: Path) -> None:
-        self.views = sheets.evenly_spaced(range(len(trainer.data.scene.train)), VIEWS)
         self.folder = folder
         self.passed = self._passed(trainer)
+        self.rows: dict[int, dict[int, np.ndarray]] = {}  # view -> its rows by moment
+        for view in sheets.evenly_spaced(range(len(trainer.data.scene.train)), VIEWS):
+            paths = {k: self._row(trainer, view, k) for k in range(1, self.passed + 1)}
+            self.rows[view] = {k: read_png_rgb(path) for k, path in paths.items() if path.is_file()}
 
     def _passed(self, trainer: Trainer) -> int:
         done = trainer.progress(trainer.iteration)
@@ -50,13 +53,13 @@ class Recorder:
 
     def __call__(self, trainer: Trainer) -> None:
         """Draw the rows if a moment was passed since the last call."""
-        passed = self._passed(trainer)
-        if passed == self.passed:
+        before, self.passed = self.passed, self._passed(trainer)
+        if self.passed in (0, before):  # a rollback may lead to before the first moment
             return
-        self.passed = passed
-        for view in self.views:
-            write_png(self._row(trainer, view, passed), strip(trainer, view))
-        self._join(trainer)
+        for view, rows in self.rows.items():
+            row = rows[self.passed] = strip(trainer, view)
+            write_png(self._row(trainer, view, self.passed), row, compressed=False)
+        self._join(trainer, compressed=False)
 
     def _row(self, trainer: Trainer, view: int, moment: int) -> Path:
         return self.folder / ROWS / file_stem(trainer, view) / f"{moment}.png"
@@ -67,15 +70,13 @@ class Recorder:
         shutil.rmtree(self.folder / ROWS, ignore_errors=True)
         return written
 
-    def _join(self, trainer: Trainer) -> list[Path]:
+    def _join(self, trainer: Trainer, compressed: bool = True) -> list[Path]:
         written = []
-        for view in self.views:
-            paths = [self._row(trainer, view, k) for k in range(1, len(MOMENTS) + 1)]
-            rows = [read_png_rgb(path) for path in paths if path.is_file()]
+        for view, rows in self.rows.items():
             if rows:
                 path = self.folder / "pictures" / f"training_{file_stem(trainer, view)}.png"
                 path.parent.mkdir(exist_ok=True)
-                write_png(path, sheets.stack(rows, 0))
+                write_png(path, sheets.stack([*rows.values()], 0), compressed)
                 written.append(path)
         return written
 

@@ -13,6 +13,7 @@ masks. A train view looks at a surface that is in its frame and not behind anoth
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -215,6 +216,7 @@ psnr_supported, psnr_valid = partial(_psnr, SUPPORTED), partial(_psnr, VALID)
 psnr_consistent = partial(_psnr, CONSISTENT)
 
 _last: list[tuple[Scene, Regions]] = []  # a cache of the latest scene only
+_finding = threading.Lock()  # metrics ask on several threads
 
 
 def find_regions(scene: Scene) -> Regions:
@@ -223,9 +225,10 @@ def find_regions(scene: Scene) -> Regions:
     Raises:
         AwError: a mask of a test photo has another size than the photo.
     """
-    if not _last or _last[0][0] is not scene:
-        _last[:] = [(scene, _find_regions(scene))]
-    return _last[0][1]
+    with _finding:
+        if not _last or _last[0][0] is not scene:
+            _last[:] = [(scene, _find_regions(scene))]
+        return _last[0][1]
 
 
 def _find_regions(scene: Scene) -> Regions:

@@ -67,7 +67,7 @@ def encode_spz(
         _pack_quats(gaussians["quats"]).tobytes(),
         _pack_harmonics(gaussians["sh_rest"]).tobytes(),
     ]
-    packed = gzip.compress(b"".join(parts), 9, mtime=0)
+    packed = gzip.compress(b"".join(parts), 6, mtime=0)  # 9: seven times the time, 2 % smaller
     if transform == UNMOVED:
         return [packed]
     comment = json.dumps(transform_record(transform)).encode("ascii")

@@ -74,7 +74,10 @@ def save_as(figure: Any, path: Path) -> None:
     import matplotlib
 
     with matplotlib.rc_context({"svg.hashsalt": "aw", "pdf.fonttype": 42}), atomic_path(path) as temporary:
-        figure.savefig(temporary, metadata=UNDATED[path.suffix.lower()])
+        suffix = path.suffix.lower()
+        # a third of the time of Pillow's 6, a file 9 % larger
+        fast = {"pil_kwargs": {"compress_level": 3}} if suffix == ".png" else {}
+        figure.savefig(temporary, metadata=UNDATED[suffix], **fast)
 
 
 class LineStyle(TypedDict):

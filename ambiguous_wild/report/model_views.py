@@ -242,7 +242,7 @@ def video_runs(
             if gif is not None and number in chosen:
                 kept.append(narrowed(frame, gif_width))
             yield frame
-            if number == 1:  # written, and most of what only the first frames take is over
+            if number == 2:  # two are written, and most of what only the first frames take is over
                 spent = time.perf_counter() - begin
                 say(f"about {duration(spent * frames / 2)}; a smaller --width or --fps is faster")
 

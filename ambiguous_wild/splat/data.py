@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
-from ambiguous_wild.core.machine import usable_memory
+from ambiguous_wild.core.machine import in_order, photo_threads, usable_memory
 from ambiguous_wild.io.corrections import corrected
 from ambiguous_wild.io.images import as_float, load_image_codes, read_alpha, read_keep_map
 from ambiguous_wild.io.keep_resize import smaller_keep
@@ -82,8 +82,8 @@ def read_photos(files: Sequence[Path], cameras: Sequence[Camera], device: torch.
     if not fit(12 * sum(camera.height * camera.width for camera in cameras), device):  # 3 channels of 4 bytes
         copies = CudaCopies(device) if device.type == "cuda" else FileReads()
     held: list[Any] = []
-    for file, camera in zip(files, cameras, strict=True):
-        codes = load_image_codes(file)
+    readers = photo_threads(max((camera.height * camera.width for camera in cameras), default=0))
+    for file, camera, codes in zip(files, cameras, in_order(load_image_codes, files, readers), strict=True):
         if codes.shape[:2] != (camera.height, camera.width):
             raise AwError(
                 f"{file} is {codes.shape[1]}x{codes.shape[0]} px, its camera says "

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import repeat
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from ambiguous_wild.core import UNMOVED, AwError, Camera, Scene, View
+from ambiguous_wild.core.machine import in_order, photo_threads
 from ambiguous_wild.core.scene import NO_PHOTO
 from ambiguous_wild.io.files import check_output, refuse_file
-from ambiguous_wild.io.images import read_gray, read_png_rgb
+from ambiguous_wild.io.images import header_size, read_gray, read_png_rgb
 from ambiguous_wild.io.mask_reasons import WIDTH as REASONS_WIDTH
 from ambiguous_wild.io.mask_reasons import read_reasons, regions_uri
 from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
@@ -345,9 +348,10 @@ def _fill(title: str, data: Mapping[str, object], models: str) -> str:
 def photo_uris(paths: Sequence[Path], most_bytes: int) -> list[str]:
     """Return a data: address of each photo as JPEG, at the largest width at which all fit `most_bytes`.
 
-    1000 photos or more can exceed it at the smallest width. One photo is in memory at a time.
+    1000 photos or more can exceed it at the smallest width. A few photos are in memory at a time.
     """
-    return _as_wide_as_fits(_photo, paths, WIDTHS, most_bytes)
+    sizes = [math.prod(header_size(path) or (0, 0)) for path in paths]
+    return _as_wide_as_fits(_photo, paths, WIDTHS, most_bytes, photo_threads(max(sizes, default=0)))
 
 
 def _changed_ns(path: Path) -> int:
@@ -400,15 +404,19 @@ def _keep_maps(
 
 
 def _as_wide_as_fits(
-    uri: Callable[[Source, int], str], sources: Sequence[Source], widths: Sequence[int], most_bytes: int
+    uri: Callable[[Source, int], str],
+    sources: Sequence[Source],
+    widths: Sequence[int],
+    most_bytes: int,
+    threads: int = 1,
 ) -> list[str]:
     """Return the addresses at the first width at which they fit, else at the last one."""
     uris: list[str] = []
     for width in widths:
         uris, size = [], 0
-        for source in sources:
-            uris.append(uri(source, width))
-            size += len(uris[-1])
+        for address in in_order(lambda pair: uri(*pair), zip(sources, repeat(width)), threads):
+            uris.append(address)
+            size += len(address)
             if size > most_bytes and width != widths[-1]:
                 break
         else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -270,6 +271,8 @@ def labelled(picture: Frame, label: str) -> Frame:
 def write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> int:
     """Write frames atomically as VP9 in mp4, through OpenCV's FFmpeg (LGPL), and return their number.
 
+    The encoder has one thread of its own: the next frame is drawn meanwhile.
+
     Raises:
         AwError: this OpenCV has no such encoder.
         KeyboardInterrupt: it was interrupted; the message says that NAME-part.mp4 has the frames until then.
@@ -278,15 +281,20 @@ def write_mp4(path: Path, frames: Iterator[Frame], fps: float) -> int:
 
     with atomic_path(path) as temporary:
         writer, count, interrupted = None, 0, False
+        encoder, encoding = ThreadPoolExecutor(1), Future[None]()
+        encoding.set_result(None)
         try:
             for frame in frames:
                 if writer is None:
                     writer = _open(temporary, path, frame, fps)
-                writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+                encoding.result()
+                encoding = encoder.submit(writer.write, cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
                 count += 1
+            encoding.result()
         except KeyboardInterrupt:
             interrupted = True
         finally:
+            encoder.shutdown()
             if writer is not None:
                 writer.release()
         if interrupted:

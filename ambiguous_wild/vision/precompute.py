@@ -7,12 +7,12 @@ damaged, changed or put under the name of another is computed anew.
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,12 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import config_hash, to_plain
+from ambiguous_wild.core.machine import in_order
 from ambiguous_wild.io.files import atomic_path, sha256_array
 from ambiguous_wild.io.progress_bar import terminal_bar
 from ambiguous_wild.vision.label_maps import LabelMaps
 from ambiguous_wild.vision.protocols import Features, Instances, SceneInstances
+from ambiguous_wild.vision.segments import GraphSegments
 
 Arrays = dict[str, np.ndarray]
 STALE_S = 24 * 3600.0  # older temporary files are leftovers of a killed process
@@ -73,7 +75,7 @@ def _seal(key: str, arrays: Arrays) -> str:
     return config_hash([key, {name: sha256_array(array) for name, array in arrays.items()}])
 
 
-@functools.cache  # once per process and folder, because it lists every entry
+@cache  # once per process and folder, because it lists every entry
 def _tidy(folder: Path) -> None:
     """Remove temporary files of killed processes; a recent one may still be in use."""
     for left in folder.glob(".*.tmp*"):
@@ -134,6 +136,7 @@ def instance_labels(
     photos: Sequence[Tensor],
     names: Sequence[str],
     folder: Path,
+    threads: int = 1,
 ) -> SceneLabels:
     """Label maps of every photo, with the scene's identities if the back end provides them.
 
@@ -142,13 +145,16 @@ def instance_labels(
         photos: [H, W, 3] in [0, 1].
         names: names of the photos.
         folder: the cache; photos and chunks in it are not computed again.
+        threads: photos that are segmented at a time, by back ends without a network.
     """
     shown = terminal_bar(f"instances ({instances.name.partition('-')[0]})")
     if isinstance(instances, SceneInstances):
         return SceneLabels(instances.identities(photos, names, folder, shown), True)
     if isinstance(instances, LabelMaps):
         return SceneLabels(instances.labels_of(photos, names), False)
-    return SceneLabels([photo_labels(instances, photo, folder) for photo in shown(photos)], False)
+    labels_of = partial(photo_labels, instances, folder=folder)
+    threads = threads if isinstance(instances, GraphSegments) else 1
+    return SceneLabels(list(in_order(labels_of, shown(photos), threads)), False)
 
 
 def photo_labels(instances: Instances, photo: Tensor, folder: Path | None) -> np.ndarray:

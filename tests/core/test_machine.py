@@ -1,8 +1,11 @@
 """Machines as people have them: containers, no home, another code page, another OpenCV."""
 
+import itertools
 import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import cv2
@@ -39,6 +42,25 @@ def test_cores_are_those_of_the_quota(cgroup, files, cores):
         (cgroup / name).parent.mkdir(parents=True, exist_ok=True)
         (cgroup / name).write_text(text)
     assert machine.usable_cores() == cores
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_results_come_in_order_and_few_are_begun_before_they_are_taken(threads):
+    begun, caller = [], threading.get_ident()
+
+    def squared(k):
+        begun.append(threading.get_ident() == caller)
+        if k == 12:
+            raise ValueError("twelve")
+        time.sleep(0.002 * (k % 3))  # the third is ready before the second
+        return k * k
+
+    results = machine.in_order(squared, itertools.count(), threads)
+    for k in range(8):
+        assert next(results) == k * k and len(begun) <= k + 1 + threads
+    assert set(begun) == {threads == 1}
+    with pytest.raises(ValueError, match="twelve"):
+        list(results)
 
 
 def test_memory_limits_how_many_large_photos_are_read_at_once(cgroup):

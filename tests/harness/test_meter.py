@@ -162,7 +162,7 @@ def test_the_kernel_is_read_on_all_threads_and_on_one():
 
 def test_calibrations_come_often_at_first_and_every_fifteen_seconds_later(tmp_path, monkeypatch):
     Machine(monkeypatch)
-    for total, step, fewest, most in ((0.5, 0.01, 2, 2), (20.0, 0.1, 18, 22), (300.0, 0.5, 65, 80)):
+    for total, step, fewest, most in ((0.5, 0.01, 2, 2), (40.0, 0.1, 20, 28), (300.0, 0.5, 42, 55)):
         m = meter(tmp_path)
         m.begin(0.0)
         for k in range(1, round(total / step) + 1):

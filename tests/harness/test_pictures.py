@@ -9,6 +9,7 @@ import torch
 
 from ambiguous_wild.harness import sheets
 from ambiguous_wild.harness.cell import RunOptions
+from ambiguous_wild.harness.evaluate import write_masks
 from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.harness.pictures import (
     CELL,
@@ -122,6 +123,15 @@ def test_pictures_grow_while_any_method_trains(scene, tmp_path):
         heights.append(read_png_rgb(paths[0]).shape[0] if paths else 0)
     row = sheets.BAR + sheets.GAP + round(HEIGHT * CELL / WIDTH)
     assert sorted(set(heights)) == [0, row, 2 * row, 3 * row]
+    trainer.iteration = 0  # rolled back to before the first moment
+    recorder(trainer)
+    assert [read_png_rgb(path).shape[0] for path in recorder.finish(trainer)] == 3 * [3 * row]
+
+
+def test_no_view_is_drawn_for_the_masks_of_a_method_without_any(scene, tmp_path, monkeypatch):
+    trainer = trainer_for(scene, tmp_path, MethodHooks())
+    monkeypatch.setattr(trainer, "make_step", None)
+    assert write_masks(trainer, tmp_path / "masks") is None and (tmp_path / "masks").is_dir()
 
 
 def test_pictures_can_be_left_away(scene, tmp_path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError, Camera
+from ambiguous_wild.harness import regions
 from ambiguous_wild.harness.measures import measure_images, metrics
 from ambiguous_wild.harness.regions import find_regions
 from ambiguous_wild.io.scene_folder import load_scene
@@ -103,6 +106,25 @@ def test_a_users_mask_of_a_test_photo_is_what_psnr_valid_measures(tmp_path: Path
     cv2.imwrite(str(root / "masks" / "test" / TEST[0]), keep[:-1])
     with pytest.raises(AwError, match="its photo is 64x48"):
         find_regions(load_scene(root))
+
+
+def test_metrics_are_the_same_on_several_threads_and_regions_are_found_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = scene_with_part_hidden(tmp_path / "scene", 3)
+    find, scenes = regions._find_regions, []
+    monkeypatch.setattr(regions, "_find_regions", lambda scene: scenes.append(scene) or find(scene))
+    images = np.random.default_rng(0).integers(0, 256, (len(TEST), 2, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    asked = [metric for metric in metrics().values() if "lpips" not in metric.key]
+    one, several = (
+        measure_images(
+            [(name, *pair) for name, pair in zip(TEST, images)],
+            asked, load_scene(root), around=partial(nullcontext, threads),
+        )
+        for threads in (1, 3)
+    )  # fmt: skip
+    assert one == several and list(one[0][0]) == list(several[0][0]) and "psnr_covered" in one[0][0]
+    assert len(scenes) == 2
 
 
 def test_depth_between_points_is_exact_on_a_plane_and_ignores_what_lies_behind() -> None:

@@ -25,8 +25,9 @@ from ambiguous_wild.io.images import (
 def test_png_gives_back_every_pixel(tmp_path_factory, width, height, seed):
     path = tmp_path_factory.mktemp("png") / "фото é.png"
     image = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
-    write_png(path, image)
-    assert np.array_equal(read_png_rgb(path), image)
+    for compressed in (False, True):
+        write_png(path, image, compressed)
+        assert np.array_equal(read_png_rgb(path), image)
     assert image_size(path) == (width, height)
     assert np.array_equal(load_image_float(path), image.astype(np.float32) / np.float32(255))
     first = path.read_bytes()

@@ -6,6 +6,8 @@ import json
 import math
 import re
 import signal
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -166,6 +168,38 @@ def test_frames_come_back_nearly_as_they_were(tmp_path: Path) -> None:
         write_mp4(tmp_path / "none.mp4", iter([]), 24)
     with pytest.raises(AwError, match="no frame"):
         write_gif(tmp_path / "none.gif", [], 10)
+
+
+def test_a_frame_is_drawn_while_the_one_before_is_encoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn, written = threading.Event(), []
+
+    class Encoder:
+        def write(self, frame: np.ndarray) -> None:
+            assert drawn.wait(10), "the second frame waits for the first"
+            written.append(int(frame[0, 0, 0]))
+
+        def release(self) -> None:
+            (tmp_path / "released").touch()
+
+    def frames(last: int) -> Iterator[np.ndarray]:
+        for k in range(last):
+            if k == 1:
+                drawn.set()
+            yield np.full((2, 2, 3), k, np.uint8)
+
+    def opened(temporary: Path, *given: object) -> Encoder:
+        temporary.write_bytes(b"video")
+        return Encoder()
+
+    monkeypatch.setattr(video, "_open", opened)
+    assert write_mp4(tmp_path / "v.mp4", frames(4), 24) == 4
+    assert written == [0, 1, 2, 3] and (tmp_path / "released").exists()
+    monkeypatch.setattr(Encoder, "write", lambda self, frame: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        write_mp4(tmp_path / "none.mp4", frames(4), 24)
+    assert not (tmp_path / "none.mp4").exists()
 
 
 def test_frames_until_an_interruption_are_kept_beside_an_earlier_video(

@@ -20,6 +20,7 @@ from ambiguous_wild.methods.refinesplat.identity import (
     train_psi,
 )
 from ambiguous_wild.methods.refinesplat.masks import instance_means
+from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.mask_ops import add_new
 from ambiguous_wild.vision.precompute import cache_key, cached, instance_labels, photo_features
@@ -49,7 +50,7 @@ class FrozenInputs:
     ) -> None:
         self._data, self.features, self._config = data, features, config
         names = [view.name for view in data.scene.train]
-        segmented = instance_labels(instances, data.photos, names, data.cache_dir)
+        segmented = instance_labels(instances, data.photos, names, data.cache_dir, threads())
         self._scene_wide = segmented.scene_wide
         own = segmented.labels
         # ids of a whole scene have gaps in a photo: labels count from 1, and `_ids` holds their ids

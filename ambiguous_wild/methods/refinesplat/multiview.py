@@ -35,6 +35,7 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.methods.refinesplat.maps import (
+    EnlargedMaps,
     MapStack,
     Ranks,
     Selected,
@@ -97,7 +98,6 @@ class _Query:
     origin: Tensor  # [n, 3, 1]
     x: Tensor  # [w] coordinates of its rays at depth 1
     y: Tensor  # [h, 1]
-    sparse_depth: Tensor | None  # [h, w], depth of the sparse points' surface, NaN if none
     shrink: tuple[Tensor, Tensor]  # matrices that shrink its evidence, [h, H], [W, w], see `blur_and_shrink`
 
 
@@ -123,7 +123,7 @@ class _Answers:
 
 
 class OtherViews:
-    """The last evidence of every view about the surfaces it shows, in three stacks of maps."""
+    """The last evidence of every view about the surfaces it shows, in four stacks of maps."""
 
     def __init__(
         self,
@@ -139,18 +139,20 @@ class OtherViews:
         self.near = near = nearest_views(cameras, config.views)
         self.count = len(near[0])
         self.ranks = Ranks(self.count, config.quantile, device)
-        # evidence, and colours from 0 to 255
-        stored = [
-            np.concatenate([np.zeros((1, *size), np.float32), np.moveaxis(colours, 2, 0).astype(np.float32)])
-            for size, photo, camera in zip(self.sizes, photos, cameras, strict=True)
-            for colours in [small_colours(photo, half_size(camera))]
-        ]
-        self.stored = MapStack(stored, device, pad="edge")
-        self.depth = MapStack([np.zeros((1, *size), np.float32) for size in self.sizes], device)
+        self.evidence = MapStack(self.sizes, device, pad="edge")
+        # from 0 to 255
+        self.colours = MapStack(self.sizes, device, channels=3, dtype=torch.uint8, pad="edge")
+        for view, (photo, camera) in enumerate(zip(photos, cameras, strict=True)):
+            for channel, plane in enumerate(np.moveaxis(small_colours(photo, half_size(camera)), 2, 0)):
+                self.colours.put(view, sized(plane, device), channel)
+        self.depth = MapStack(self.sizes, device)
         # copied to `surface` once the view has stored evidence, like its depth
         self.known_surfaces = [None if s is None else sized(_depths(s), device) for s in sparse]
-        blank = np.zeros((1, 1), np.float32)
-        self.surface = MapStack([np.zeros_like(blank if s is None else s)[None] for s in sparse], device)
+        self.surface = MapStack([(1, 1) if s is None else s.shape for s in sparse], device)
+        # depth of the sparse points' surface of each view, [h, w], NaN if none
+        self.sparse_depth = EnlargedMaps(
+            lambda view: _at_depth(sparse[view], self.sizes[view]), len(cameras), device
+        )
         self.stored_views: set[int] = set()  # views with stored evidence
         # made once for each size, because they take as much memory as the maps
         shrinks = {
@@ -166,7 +168,6 @@ class OtherViews:
                 cameras,
                 near[view],
                 self.sizes[view],
-                sparse[view],
                 shrinks[camera.height, camera.width],
             )
             for view, camera in enumerate(cameras)
@@ -181,14 +182,14 @@ class OtherViews:
             depth: [h, w] at half this size, from `halved`.
         """
         rows, columns = self.queries[view].shrink
-        self.stored.put(view, rows @ evidence @ columns, channel=0)
+        self.evidence.put(view, rows @ evidence @ columns)
         self.depth.put(view, depth)
         self._mark_known(view)
 
     def restore(self, evidence: dict[int, Tensor], depth: dict[int, Tensor]) -> None:
         """Restore the evidence of views from a checkpoint, [h, w] at half their photos' size."""
         for view, stored in evidence.items():
-            self.stored.put(view, stored, channel=0)
+            self.evidence.put(view, stored)
             self.depth.put(view, depth[view])
             self._mark_known(view)
 
@@ -212,12 +213,13 @@ class OtherViews:
         if not self.count:
             return None
         own, config, shape = self.queries[view], self.config, depth.shape
-        stacks = self.stored, self.depth, self.surface
         points = _NeighbourRays(
             torch.addcmul(torch.addcmul(own.ahead, own.down, own.y), own.right, own.x).flatten(2),
             own.origin,
-            self.stored.of(view)[1:].flatten(1),
-            *(stack.select(own.neighbours) for stack in stacks),
+            self.colours.of(view).flatten(1).float(),
+            self.evidence.select(own.neighbours, self.colours),
+            self.depth.select(own.neighbours),
+            self.surface.select(own.neighbours),
         )
         answers, difference = self._look_up(points, slice(None), depth.flatten())
         offset = None
@@ -226,8 +228,9 @@ class OtherViews:
             offset = common_offset(some, same, config.agree)
             answers = replace(answers, agree=agree(difference, answers.same, config.agree, offset))
         few = answers.same.sum(0) < config.known_by
-        if own.sparse_depth is not None:
-            self._look_up_sparse(points, own.sparse_depth.flatten(), answers, few, offset)
+        sparse_depth = self.sparse_depth[view]
+        if sparse_depth is not None:
+            self._look_up_sparse(points, sparse_depth.flatten(), answers, few, offset)
         seen = answers.same.sum(0)
         weight = agreement_weight(seen, answers.agree.sum(0), config.agreeing, few)
         evidence = self.ranks.quantile_of(answers.evidence, seen)
@@ -324,7 +327,6 @@ def _query_of(
     cameras: Sequence[Camera],
     near: Sequence[int],
     size: tuple[int, int],
-    inverse: np.ndarray | None,
     shrink: tuple[Tensor, Tensor],
 ) -> _Query:
     camera, (h, w), device = cameras[view], size, shrink[0].device
@@ -339,10 +341,6 @@ def _query_of(
     right, down, ahead = (sized(frames[:, :, k, None, None], device) for k in range(3))
     x = ((np.arange(w) + 0.5) * (camera.width / w) - camera.cx) / camera.fx
     y = ((np.arange(h) + 0.5) * (camera.height / h) - camera.cy) / camera.fy
-    sparse = None
-    if inverse is not None:
-        with np.errstate(divide="ignore"):
-            sparse = 1.0 / cv2.resize(inverse, (w, h), interpolation=cv2.INTER_NEAREST)
     return _Query(
         neighbours=torch.from_numpy(np.array(near, np.int64)).to(device),
         right=right,
@@ -351,7 +349,6 @@ def _query_of(
         origin=sized(frames[:, :, 3:], device),
         x=sized(x, device),
         y=sized(y[:, None], device),
-        sparse_depth=None if sparse is None else sized(sparse, device),
         shrink=shrink,
     )
 
@@ -360,6 +357,14 @@ def _depths(inverse: np.ndarray) -> np.ndarray:
     """Return the depths of a map of inverse depths, float32; 0 where unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(inverse > 0, 1.0 / inverse, 0.0).astype(np.float32)
+
+
+def _at_depth(inverse: np.ndarray | None, size: tuple[int, int]) -> np.ndarray | None:
+    """Return the depths [h, w] of a map of inverse depths, NaN where unknown."""
+    if inverse is None:
+        return None
+    with np.errstate(divide="ignore"):
+        return 1.0 / cv2.resize(inverse, size[::-1], interpolation=cv2.INTER_NEAREST)
 
 
 def half_size(camera: Camera) -> tuple[int, int]:

@@ -1,6 +1,11 @@
 """A GPU against float64 and gsplat's own loop: parity, training, milliseconds a step, frames a second.
 
     python benchmarks/gpu.py --scene SCENE [--methods 3dgs refinesplat] [--iterations 7000]
+    python benchmarks/gpu.py --scene SCENE --count 150000
+
+The second command needs no GPU: it runs torch's part of a step there on the CPU, with so many Gaussians and
+our renderer in place of gsplat's, and lists the bytes of living tensors and the calls that a GPU would launch
+(benchmarks/results/memory.md). Memory that libraries take without a tensor is not in it.
 
 Four measurements, printed and written to benchmarks/results/gpu.json:
 
@@ -19,13 +24,20 @@ import argparse
 import dataclasses
 import sys
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
+from job_queue import write_section
 from torch import Tensor
+from torch.multiprocessing.reductions import StorageWeakRef
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import environment
@@ -34,7 +46,7 @@ from ambiguous_wild.harness.run_cost import peak_memory, reset_peak
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import get_method
-from ambiguous_wild.splat import readiness, training_loop
+from ambiguous_wild.splat import backend, readiness, training_loop
 from ambiguous_wild.splat.backend import wait
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -47,6 +59,7 @@ from ambiguous_wild.stress import stress_table
 from ambiguous_wild.stress.case import run
 
 RESULTS = Path(__file__).parent / "results" / "gpu.json"
+COUNTED = RESULTS.with_name("memory.md")
 BLOCK = 50  # steps of a loop before the next loop has its turn
 
 
@@ -182,6 +195,73 @@ def cost(args: argparse.Namespace, base: Trainer) -> dict[str, float]:
     return {name: 1e3 * seconds / (args.turns * BLOCK) for name, seconds in spent.items()}
 
 
+class Tensors(TorchDispatchMode):
+    """Bytes of the tensors that live, their peak and the launches in every part of a step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.part = "set-up"
+        self.living: dict[int, tuple[StorageWeakRef, int, str]] = {}
+        self.peaks: dict[
+            str, tuple[int, list[tuple[int, str]]]
+        ] = {}  # bytes, and those of the largest tensors
+        self.launches: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        given = {t.untyped_storage()._cdata for t in tree_leaves((args, kwargs)) if isinstance(t, Tensor)}
+        made = {t.untyped_storage()._cdata: t for t in tree_leaves(out) if isinstance(t, Tensor)}
+        self.living = {k: entry for k, entry in self.living.items() if not entry[0].expired()}
+        for key in made.keys() - given - self.living.keys():
+            storage, shape = made[key].untyped_storage(), list(made[key].shape)
+            what = f"{str(made[key].dtype)[6:]} {shape} of {func._schema.name[6:]}"
+            self.living[key] = StorageWeakRef(storage), storage.nbytes(), what
+        # a view is no launch; what writes into its arguments is one
+        self.launches[self.part] += bool(made.keys() - given) or func._schema.is_mutable
+        total = sum(size for _, size, _ in self.living.values())
+        if total > self.peaks.get(self.part, (-1, []))[0]:
+            self.peaks[self.part] = total, [(size, what) for _, size, what in self.living.values()]
+        return out
+
+    @contextmanager
+    def named(self, part: str) -> Iterator[None]:
+        """Count for this part until the `with` ends."""
+        before, self.part = self.part, part
+        try:
+            yield
+        finally:
+            self.part = before
+
+
+def count(args: argparse.Namespace, method: str) -> list[str]:
+    """Rows of a table: the parts of a step of the method, and its growth."""
+    with (
+        mock.patch.object(backend, "accelerated", lambda device: True),
+        mock.patch.object(backend.GpuBackend, "render", backend.Backend.render),
+        Tensors() as tensors,
+    ):
+        trainer = trainer_of(args, method, 10**6)
+        photos = len(trainer.data.photos)
+        rng = torch.Generator().manual_seed(0)
+        rows = torch.randint(len(trainer.gaussians), (args.count,), generator=rng)
+        gaussians = trainer.gaussians.select(rows)
+        gaussians.means += gaussians.log_scales.exp() * torch.randn(gaussians.means.shape, generator=rng)
+        gaussians.log_scales -= 1.0
+        late(trainer, gaussians)
+        trainer.clock.part = tensors.named  # type: ignore[method-assign]
+        for _ in range(4 * photos + 1):  # every mask twice
+            trainer.step()
+        launches = {part: n / (4 * photos + 1) for part, n in tensors.launches.items()}
+        trainer.density.config = dataclasses.replace(trainer.density.config, start=0.0, min_every=1)
+        trainer.clock.part = lambda part: tensors.named("growth" if part == "density" else part)
+        trainer.step()
+    lines = []
+    for part, (total, parts) in tensors.peaks.items():
+        largest = "; ".join(f"{size / 1e6:.0f} {what}" for size, what in sorted(parts)[-3:][::-1])
+        lines.append(f"| {method} | {part} | {total / 1e6:.0f} | {launches.get(part, 0):.0f} | {largest} |")
+    return lines
+
+
 def main(words: list[str] | None = None) -> int:
     p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     p.add_argument("--scene", type=Path, required=True, help="a scene folder, e.g. of aw build-scene")
@@ -191,8 +271,19 @@ def main(words: list[str] | None = None) -> int:
     p.add_argument("--turns", type=int, default=12, help=f"turns of {BLOCK} steps")
     p.add_argument("--work", type=Path, default=Path("gpu-benchmark"), help="checkpoints and caches")
     p.add_argument("--results", type=Path, default=RESULTS)
+    p.add_argument("--count", type=int, metavar="GAUSSIANS", help="count tensors and launches, without a GPU")
     p.add_argument("--device", default="cuda", help=argparse.SUPPRESS)
     args = p.parse_args(words)
+    if args.count:
+        args.device = "cpu"
+        head = [
+            "| method | part | peak, MB | launches a step | largest tensors, MB |",
+            "|---|---|---:|---:|---|",
+        ]
+        lines = head + [line for method in args.methods for line in count(args, method)]
+        write_section(COUNTED, f"Tensors on a GPU, {args.count} Gaussians", "\n".join(lines))
+        print("\n".join(lines))
+        return 0
     try:
         if args.device == "cuda":
             readiness.require(readiness.look())

@@ -21,6 +21,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import flatten
 from ambiguous_wild.harness.result_file import RESULT, read_result
 from ambiguous_wild.harness.store import read_config
+from ambiguous_wild.io.files import write_text
 
 
 def exit_code(main: Callable[[], int | None]) -> int | None:
@@ -44,6 +45,14 @@ def aw(*words: str) -> str:
         lines = (done.stderr.strip() or done.stdout.strip() or f"exit code {done.returncode}").splitlines()
         raise AwError(f"aw {' '.join(words[:2])}: {lines[-1]}")
     return done.stdout
+
+
+def write_section(path: Path, title: str, body: str) -> None:
+    """Write a section of a page of results, in place of the earlier one of this title."""
+    text = path.read_text(encoding="utf-8") if path.is_file() else f"# {path.stem.capitalize()}\n"
+    head, *sections = text.split("\n## ")
+    kept = [section for section in sections if section.partition("\n")[0] != title]
+    write_text(path, "\n## ".join([head, *kept, f"{title}\n\n{body}\n"]))
 
 
 def find_scenes(folders: Iterable[Path]) -> list[Path]:

@@ -6,9 +6,13 @@ import re
 import runpy
 import sys
 
+import numpy as np
 import pytest
 
+from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.io.scene_folder import load_scene
 from tests.benchmark_scripts import BENCHMARKS, benchmark
+from tests.tiny_scene import write_tiny_scene
 
 SCRIPTS = sorted(path for path in BENCHMARKS.glob("*.py") if "__main__" in path.read_text(encoding="utf-8"))
 
@@ -49,3 +53,28 @@ def test_the_readme_counts_the_scenes_on_which_refinesplat_is_first():
         ]
         first = sum(row[figures.RANKED.index("refinesplat")] == max(row) for row in psnr)
         assert f"first on {first} of {len(psnr)} scenes" in (figures.ROOT / "README.md").read_text("utf-8")
+
+
+def test_peaks_of_memory_are_measured_on_enlarged_photos(tmp_path, monkeypatch, capsys):
+    scene = load_scene(write_tiny_scene(tmp_path / "scene"))
+    with benchmark("memory") as memory:
+        monkeypatch.setattr(memory, "PIXELS", 192 * 144)
+        monkeypatch.setattr(memory, "TRAINED", (96, 96))
+        monkeypatch.setattr(memory, "GAUSSIANS", 50)
+        work, page = tmp_path / "work", tmp_path / "memory.md"
+        words = [str(scene.root), "--work", str(work), "--results", str(page), "--only", "view"]
+        monkeypatch.setattr(sys, "argv", ["memory.py", *words])
+        memory.main()
+        monkeypatch.setattr(memory, "measure", lambda *_: pytest.fail("it was measured before"))
+        memory.main()
+    (row,) = (line for line in page.read_text().splitlines() if line.startswith("| view"))
+    assert 0.05 < float(row.split("|")[3]) < 4 and capsys.readouterr().out.count("GB") == 1
+    large = load_scene(work / "scene")
+    assert (work / "now" / "view" / "index.html").is_file()
+    photos = [read_png_rgb(path).shape for path in (work / "photos").glob("*.jpg")]
+    assert photos == [(144, 192, 3)] * len(scene.views) and len(large.views) == len(scene.views)
+    for view, small in zip(large.views, scene.views, strict=True):
+        assert read_png_rgb(view.image_path).shape == (96, 96, 3)
+        assert view.camera.fx == pytest.approx(1.5 * small.camera.fx)
+        assert view.camera.fy == pytest.approx(2.0 * small.camera.fy)
+        assert np.allclose(view.camera.cam_from_world, small.camera.cam_from_world)

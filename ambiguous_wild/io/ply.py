@@ -75,24 +75,16 @@ def encode_ply(
     """Return the parts of a splat PLY, see `write_splat_ply`."""
     gaussians = rescaled(gaussians, 1 / transform.scale)
     n, rest = gaussians["sh_rest"].shape[:2]
-    table = np.concatenate(
-        [
-            gaussians["means"],
-            np.zeros((n, 3)),
-            gaussians["sh0"],
-            gaussians["sh_rest"].transpose(0, 2, 1).reshape(n, 3 * rest),  # channel by channel
-            gaussians["opacity_logits"][:, None],
-            gaussians["log_scales"],
-            gaussians["quats"],
-        ],
-        axis=1,
-        dtype="<f4",
-        casting="same_kind",
-    )
+    table = np.empty((n, 17 + 3 * rest), "<f4")  # filled in place, as a file may have gigabytes
+    table[:, :3], table[:, 3:6], table[:, 6:9] = gaussians["means"], 0.0, gaussians["sh0"]
+    for channel in range(3):
+        table[:, 9 + channel * rest : 9 + (channel + 1) * rest] = gaussians["sh_rest"][:, :, channel]
+    table[:, -8], table[:, -7:-4] = gaussians["opacity_logits"], gaussians["log_scales"]
+    table[:, -4:] = gaussians["quats"]
     header = ["ply", "format binary_little_endian 1.0", *splat_comments(transform, antialias)]
     header += [f"element vertex {n}"]
     header += [f"property float {name}" for name in _columns(rest)] + ["end_header", ""]
-    return ["\n".join(header).encode("ascii"), table.tobytes()]
+    return ["\n".join(header).encode("ascii"), table.data]
 
 
 def rescaled(gaussians: Arrays, factor: float) -> Arrays:
@@ -180,12 +172,12 @@ def decode_ply(data: bytes, path: Path | str) -> SplatFile:
         raise AwError(f"{path} is no splat PLY: it lacks {', '.join(missing[:6])}{hint}")
 
     def columns(names: list[str]) -> np.ndarray:
-        return _floats(table, names, path).astype(np.float32)
+        return _floats(table, names, path, np.float32)
 
-    higher = np.zeros((count, 0, 3), np.float32)
-    if rest:
-        channels = columns([f"f_rest_{i}" for i in range(rest)]).reshape(count, 3, rest // 3)
-        higher = np.ascontiguousarray(channels.transpose(0, 2, 1))
+    higher = np.empty((count, rest // 3, 3), np.float32)
+    for number in range(rest):  # channel by channel
+        channel, coefficient = divmod(number, rest // 3)
+        higher[:, coefficient, channel] = columns([f"f_rest_{number}"])[:, 0]
     arrays = {
         "means": columns(["x", "y", "z"]),
         "quats": columns([f"rot_{i}" for i in range(4)]),
@@ -211,13 +203,17 @@ def _fused(arrays: Arrays, size: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def _floats(table: np.ndarray, names: Sequence[str], path: Path | str) -> np.ndarray:
-    """Return these properties, [M, len(names)] float64; whole numbers, which they cannot be, are refused."""
-    for name in names:
+def _floats(
+    table: np.ndarray, names: Sequence[str], path: Path | str, dtype: type[np.floating] = np.float64
+) -> np.ndarray:
+    """Return these properties, [M, len(names)]; whole numbers, which they cannot be, are refused."""
+    values = np.empty((len(table), len(names)), dtype)
+    for column, name in enumerate(names):
         if table.dtype[name].kind != "f":
             kind = table.dtype[name].name
             raise AwError(f"{path}: its property {name} is {kind}, not float or double; export it again")
-    return np.stack([table[name].astype(np.float64) for name in names], axis=1)
+        values[:, column] = table[name]
+    return values
 
 
 def has_chunks(data: bytes) -> bool:

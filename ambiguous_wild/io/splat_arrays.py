@@ -39,8 +39,10 @@ def finite(gaussians: Arrays) -> dict[str, np.ndarray]:
         sound &= np.isfinite(gaussians[name]).all(axis=tuple(range(1, gaussians[name].ndim)))
     norm = np.linalg.norm(gaussians["quats"].astype(np.float64), axis=1)
     sound &= norm > 0
-    kept = {name: np.asarray(gaussians[name], np.float32)[sound] for name in _NAMES}
-    kept["quats"] = (kept["quats"] / norm[sound, None]).astype(np.float32)
+    kept = {name: np.asarray(gaussians[name], np.float32) for name in _NAMES}
+    if not sound.all():  # else there is nothing to copy
+        kept, norm = {name: values[sound] for name, values in kept.items()}, norm[sound]
+    kept["quats"] = (kept["quats"] / norm[:, None]).astype(np.float32)
     return kept
 
 

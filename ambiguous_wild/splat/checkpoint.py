@@ -32,6 +32,7 @@ def save(path: Path | str, tree: State) -> None:
     """
     tensors: dict[str, torch.Tensor] = {}
     plain = _split(tree, "", tensors)
+    _separate(tensors)
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata={"format": FORMAT, "plain": json.dumps(plain)})
 
@@ -70,8 +71,7 @@ def _split(value: Any, key: str, tensors: dict[str, torch.Tensor]) -> Any:
     if isinstance(value, np.ndarray):
         value = torch.from_numpy(np.ascontiguousarray(value))
     if isinstance(value, torch.Tensor):
-        # A copy: two names may share storage, which safetensors refuses.
-        tensors[key] = value.detach().to("cpu", copy=True).contiguous()
+        tensors[key] = value.detach().to("cpu").contiguous()
         return _TENSOR
     if isinstance(value, (list, tuple)):
         return [_split(item, f"{key}/{i}", tensors) for i, item in enumerate(value)]
@@ -80,6 +80,18 @@ def _split(value: Any, key: str, tensors: dict[str, torch.Tensor]) -> Any:
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise TypeError(f"cannot store {type(value).__name__} at {key!r} in a checkpoint")
+
+
+def _separate(tensors: dict[str, torch.Tensor]) -> None:
+    """Copy tensors that share memory with one before them, which safetensors refuses."""
+    taken: dict[int, list[tuple[int, int]]] = {}  # ranges of addresses by storage
+    for key, tensor in tensors.items():
+        start, end = tensor.data_ptr(), tensor.data_ptr() + tensor.nbytes
+        ranges = taken.setdefault(tensor.untyped_storage().data_ptr(), [])
+        if any(start < other_end and other_start < end for other_start, other_end in ranges):
+            tensors[key] = tensor.clone()
+        else:
+            ranges.append((start, end))
 
 
 def _join(plain: Any, key: str, tensors: dict[str, torch.Tensor]) -> Any:

@@ -1,13 +1,15 @@
 """Photos of the training side, at every resolution of the schedule, on the device that trains.
 
-Photos that fit into `RESIDENT` of a GPU's free memory, or of the machine's memory, stay there for the whole
-run. For a GPU, others stay in pinned memory of the host, as 8-bit codes if their files have 8 bits: a quarter
-of the bytes; a CPU reads them from their files again. The training loop announces the next view (`prefetch`);
-its photo is copied or read while the step before computes.
+Photos that fit into `RESIDENT` of a GPU's free memory, or `FLOATS` of the machine's memory, stay there as
+float32 for the whole run. Others are held as the codes of their files, for 8 bits a quarter of the bytes: for
+a GPU in pinned memory of the host, for a CPU in `RESIDENT` of the memory, and what does not fit is read from
+its file again. The training loop announces the next view (`prefetch`); its photo is copied, converted or read
+while the step computes.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -25,6 +27,7 @@ from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.splat.step import TrainData
 
 RESIDENT = 0.25  # share of the memory; Gaussians, their moments, masks and gsplat's lists need the rest
+FLOATS = 0.05  # share for float32 on a CPU; to convert the codes of 1600x1200 px takes 5 ms of another thread
 READY = 3  # photos on the device at a time: this step's, the next one's, and one for comparisons
 
 
@@ -64,11 +67,11 @@ def load_train_data(
         scene=scene,
         photos=read_photos([view.image_path for view in scene.train], cameras, device),
         cameras=cameras,
-        user_keep=keeps,
+        user_keep=KeepMaps(keeps),
         device=device,
         seed=seed,
         cache_dir=cache_dir,
-        by_hand=by_hand if corrections else (),
+        by_hand=KeepMaps(by_hand) if corrections else (),
     )
 
 
@@ -79,8 +82,8 @@ def read_photos(files: Sequence[Path], cameras: Sequence[Camera], device: torch.
         AwError: a photo differs in size from its camera.
     """
     copies: Copies | None = None
-    if not fit(12 * sum(camera.height * camera.width for camera in cameras), device):  # 3 channels of 4 bytes
-        copies = CudaCopies(device) if device.type == "cuda" else FileReads()
+    if 12 * sum(camera.height * camera.width for camera in cameras) > room(device):  # 3 channels of 4 bytes
+        copies = CudaCopies(device) if device.type == "cuda" else HostReads(room(device, RESIDENT))
     held: list[Any] = []
     readers = photo_threads(max((camera.height * camera.width for camera in cameras), default=0))
     for file, camera, codes in zip(files, cameras, in_order(load_image_codes, files, readers), strict=True):
@@ -146,12 +149,33 @@ def shrink_camera(camera: Camera, factor: int) -> Camera:
     return camera if factor == 1 else camera.resized(camera.width // factor, camera.height // factor)
 
 
+class KeepMaps(Sequence[Tensor | None]):
+    """Maps [H, W] float32 of whole numbers, such as keep maps, kept as 8 bits; None where a view has none."""
+
+    def __init__(self, maps: Iterable[Tensor | None]) -> None:
+        self._codes = [None if m is None else m.to(torch.int8) for m in maps]
+
+    def __len__(self) -> int:
+        return len(self._codes)
+
+    @overload
+    def __getitem__(self, index: int) -> Tensor | None: ...
+    @overload
+    def __getitem__(self, index: slice) -> KeepMaps: ...
+    def __getitem__(self, index: int | slice) -> Tensor | KeepMaps | None:
+        if isinstance(index, slice):
+            return KeepMaps(self._codes[index])
+        codes = self._codes[index]
+        return None if codes is None else codes.float()
+
+
 class Pyramid:
     """The train photos and cameras at every size; smaller photos are made when they are first asked for."""
 
     def __init__(self, data: TrainData) -> None:
         self._data = data
-        self._photos: dict[tuple[int, int], Tensor] = {}
+        self._photos: dict[int, Tensor] = {}  # smaller photos by view
+        self._factor = 1  # of these; the schedule leaves a size for good
         self._cameras: dict[tuple[int, int], Camera] = {}
         # copies the next photo to the device while a step runs; None = all photos fit on it
         self.prefetch = getattr(data.photos, "prefetch", None)
@@ -167,9 +191,11 @@ class Pyramid:
             return self._data.photos[view]
         if self.prefetch is not None:  # the device has no room for photos, so none for smaller copies either
             return shrink(self._data.photos[view], factor)
-        if (view, factor) not in self._photos:
-            self._photos[view, factor] = shrink(self._data.photos[view], factor)
-        return self._photos[view, factor]
+        if factor != self._factor:
+            self._photos, self._factor = {}, factor
+        if view not in self._photos:
+            self._photos[view] = shrink(self._data.photos[view], factor)
+        return self._photos[view]
 
     def camera(self, view: int, factor: int) -> Camera:
         """Return the camera of `photo`, always the same object: back ends remember cameras by identity."""
@@ -191,20 +217,31 @@ class Copies(Protocol):
         """Return the photo on the device, uint8 codes or float32; work launched later waits for it."""
 
 
-class FileReads:
-    """Reads photos from their files on another thread."""
+class HostReads:
+    """Converts the codes of photos on another thread; those that do not fit are read from their files."""
 
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(1)
+    def __init__(self, room: float) -> None:
+        """
+        Args:
+            room: bytes that codes may take.
+        """
+        self._room, self._pool = room, ThreadPoolExecutor(1)
 
-    def hold(self, file: Path, codes: np.ndarray) -> Path:
-        return file
+    def hold(self, file: Path, codes: np.ndarray) -> np.ndarray | Path:
+        if codes.nbytes > self._room:
+            return file
+        self._room -= codes.nbytes
+        return codes
 
-    def begin(self, held: Path) -> Future[np.ndarray]:
-        return self._pool.submit(load_image_codes, held)
+    def begin(self, held: np.ndarray | Path) -> Future[np.ndarray]:
+        return self._pool.submit(_floats, held)
 
     def finish(self, coming: Future[np.ndarray]) -> Tensor:
-        return torch.from_numpy(as_float(coming.result()))
+        return torch.from_numpy(coming.result())
+
+
+def _floats(held: np.ndarray | Path) -> np.ndarray:
+    return as_float(load_image_codes(held) if isinstance(held, Path) else held)
 
 
 class CudaCopies:
@@ -279,9 +316,14 @@ class Photos(Sequence[Tensor]):
             self._coming[index] = self._copies.begin(self._held[index])
 
 
-def fit(needed: int, device: torch.device) -> bool:
-    """Whether this many bytes of photos may stay in the device's memory for the whole run."""
+def room(device: torch.device, share: float = FLOATS) -> float:
+    """Return how many bytes of photos may stay in the device's memory for the whole run.
+
+    Args:
+        device: of a GPU `RESIDENT` of its free memory counts.
+        share: of the machine's memory.
+    """
     if device.type == "cuda":
-        return needed <= RESIDENT * torch.cuda.mem_get_info(device)[0]
+        return RESIDENT * torch.cuda.mem_get_info(device)[0]
     memory = usable_memory()
-    return memory is None or needed <= RESIDENT * memory
+    return math.inf if memory is None else share * memory

@@ -9,7 +9,7 @@ launch a tensor; there a flag on the device can skip the step without the host's
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
 import torch
@@ -89,9 +89,7 @@ class SplatAdam:
     def select(self, rows: Tensor) -> None:
         """Keep the moments of these rows (bool mask [N] or indices), in that order; `bind` comes next."""
         self._unbind()
-        self._moments = {
-            name: (m[rows].contiguous(), v[rows].contiguous()) for name, (m, v) in self._moments.items()
-        }
+        self._change_moments(lambda moment: moment[rows].contiguous())
         self._rows = len(self._moments["means"][0])
         self._mark_up_to_date()
 
@@ -102,9 +100,16 @@ class SplatAdam:
         def longer(moment: Tensor) -> Tensor:
             return torch.cat([moment, moment.new_zeros(n, *moment.shape[1:])])
 
-        self._moments = {name: (longer(m), longer(v)) for name, (m, v) in self._moments.items()}
+        self._change_moments(longer)
         self._rows += n
         self._mark_up_to_date()
+
+    def _change_moments(self, change: Callable[[Tensor], Tensor]) -> None:
+        """Replace the moments one by one, so that never all are there twice."""
+        for name in list(self._moments):
+            first, second = self._moments.pop(name)
+            first = change(first)
+            self._moments[name] = first, change(second)
 
     @property
     def rates(self) -> Mapping[str, float]:

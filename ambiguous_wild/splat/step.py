@@ -27,7 +27,7 @@ class TrainData:
     photos: Sequence[Tensor]  # one for each train view: [H, W, 3] float32 in [0, 1], sRGB, on `device`
     cameras: list[Camera]  # one for each train view, of the size of its photo
     # [H, W] float32, 1 = static; the capture's own masks, with what was corrected by hand
-    user_keep: list[Tensor | None]
+    user_keep: Sequence[Tensor | None]
     device: torch.device
     seed: int
     cache_dir: Path  # features and instance masks that survive the run; shared between runs

@@ -347,6 +347,8 @@ class Trainer:
             self.iteration = iteration
             return math.nan
         step = self.make_step(iteration, view)
+        if self.pyramid.prefetch is not None:
+            self.pyramid.prefetch(self.pace.view(iteration + 1))
         shown = (step.photo, step.rendered.image)
         changes = [picture._version for picture in shown]  # torch counts changes in place
         with part("mask"):
@@ -382,8 +384,6 @@ class Trainer:
         events = self._learn(step, keep, gradients, skip_step)
         if "reset" in events:
             self.hooks.mask.on_opacity_reset(step)
-        if self.pyramid.prefetch is not None:
-            self.pyramid.prefetch(self.pace.view(iteration + 1))
         if events or self.watchdog.due(iteration):
             with part("watchdog"):
                 self._read_device_check()

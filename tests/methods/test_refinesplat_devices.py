@@ -125,7 +125,7 @@ def test_other_views_say_what_they_say_on_the_cpu(setting, sizes, monkeypatch):
         store(others, view, said, depth)
         wide = cv2.blur(said, (9, 9), borderType=cv2.BORDER_REPLICATE)
         small = cv2.resize(wide, (shape[1] // 2, shape[0] // 2), interpolation=cv2.INTER_AREA)
-        assert np.allclose(others.stored.of(view)[0], small, atol=2e-6)
+        assert np.allclose(others.evidence.of(view)[0], small, atol=2e-6)
         found = []
         for there in (False, True):  # kernels, or tensors
             on(monkeypatch, there)

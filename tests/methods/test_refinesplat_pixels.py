@@ -64,7 +64,7 @@ def pixel_evidence(photos, cameras, surfaces=(), **changes) -> PixelEvidence:
 def masks_of(values, labels, config, ceiling=None, unseen=None) -> PhotoMasks:
     """Of one photo whose evidence is `values`, judged alone."""
     count = int(labels.max())
-    known = Labels([labels], [np.zeros(count, bool)], [unseen], "cpu")
+    known = Labels([labels], [np.zeros(count, bool)], [None if unseen is None else ~unseen], "cpu")
     values, none = tensor(values), torch.full((1, known.most), torch.nan, dtype=torch.float64)
     ceiling = None if ceiling is None else number(ceiling)
     seen = None if unseen is None else tensor(~unseen)

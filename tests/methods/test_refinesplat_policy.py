@@ -209,7 +209,7 @@ def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene)
     _, alone, _ = examined(first_look=dataclasses.replace(look, weight=1.0))
     assert np.allclose(maps.statistic.numpy(), alone.statistic.numpy() * factor, rtol=1e-5)
     pixels = policy.masks.pixels
-    assert pixels.other_views.queries[0].sparse_depth is not None and pixels.seen[0] is not None
+    assert pixels.other_views.sparse_depth[0] is not None and pixels.seen[0] is not None
     low = dataclasses.replace(FAST.mask, ceiling=1e-6, least=50.0)
     for least in (7.0, 9.0):
         _, _, masks = examined(mask=dataclasses.replace(low, ceiling_least=least))

@@ -1,5 +1,7 @@
 """Checkpoints come back exactly, and hold nothing that could run."""
 
+import contextlib
+
 import numpy as np
 import pytest
 import torch
@@ -32,6 +34,17 @@ def test_every_kind_of_value_survives(tmp_path):
     assert (back["n"], back["x"], back["s"], back["none"], back["flag"]) == (12, 0.1 + 0.2, "ü", None, True)
     assert back["rng"] == tree["rng"]
     assert back["array"].tolist() == [0, 1, 2]
+
+
+def test_only_what_shares_memory_is_copied(tmp_path, monkeypatch):
+    stack, written = torch.arange(12.0).view(3, 4), {}
+    monkeypatch.setattr(checkpoint, "save_file", lambda tensors, path, **_: written.update(tensors))
+    tree = {"first": stack[0], "last": stack[2], "both": stack[1:], "whole": stack, "alone": torch.ones(2)}
+    with contextlib.suppress(OSError):  # nothing is written
+        checkpoint.save(tmp_path / "c.safetensors", tree)
+    kept = {name for name, tensor in tree.items() if written[f"/{name}"].data_ptr() == tensor.data_ptr()}
+    assert kept == {"first", "last", "alone"}
+    assert all(torch.equal(written[f"/{name}"], tensor) for name, tensor in tree.items())
 
 
 @pytest.mark.parametrize("content", [b"", b"junk", b"\x80\x04\x95pickle", b"\xff" * 64])

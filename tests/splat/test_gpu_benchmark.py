@@ -52,3 +52,30 @@ def test_gsplats_loop_learns(gpu, tmp_path):
     for _ in range(17):
         last = float(plain.step())
     assert last < 0.8 * first
+
+
+def test_tensors_are_counted_without_a_gpu(gpu, tmp_path, monkeypatch):
+    page = tmp_path / "memory.md"
+    monkeypatch.setattr(gpu, "COUNTED", page)
+    page.write_text("# Memory\n\n## Peaks\n\nsome\n")
+    words = f"--scene {write_tiny_scene(tmp_path / 'scene')} --work {tmp_path} --count 70"
+    assert gpu.main(words.split()) == 0
+    text = page.read_text()
+    assert text.startswith("# Memory\n\n## Peaks\n\nsome\n")
+    rows = [line.split(" | ") for line in text.splitlines() if line.startswith(("| 3dgs", "| refinesplat"))]
+    launches = {(row[0].strip("| "), row[1]): int(row[3]) for row in rows}
+    assert launches["refinesplat", "mask"] > launches["3dgs", "loss"] > 10
+    assert ("refinesplat", "growth") in launches and ("3dgs", "mask") not in launches
+
+
+def test_living_tensors_are_those_that_live(gpu):
+    with gpu.Tensors() as tensors:
+        kept = torch.zeros(1000)
+        with tensors.named("part"):
+            torch.zeros(5000)
+            view = kept[10:]
+            view.add_(1.0)
+            torch.zeros(500)
+    assert tensors.peaks["set-up"][0] == 4000 and tensors.peaks["part"][0] == 24_000
+    assert tensors.launches == {"set-up": 1, "part": 3}
+    assert any("float32 [5000] of zeros" in what for _, what in tensors.peaks["part"][1])

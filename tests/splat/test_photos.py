@@ -1,6 +1,7 @@
 """Photos read as a list are read: wherever they lie, and whenever they were sent."""
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,18 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import load_image_float, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat import data as data_module
-from ambiguous_wild.splat.data import READY, CudaCopies, FileReads, Photos, fit, load_train_data
+from ambiguous_wild.splat.data import (
+    READY,
+    RESIDENT,
+    CudaCopies,
+    HostReads,
+    KeepMaps,
+    Photos,
+    Pyramid,
+    load_train_data,
+    room,
+    shrink,
+)
 from tests.tiny_scene import write_tiny_scene
 
 CPU = torch.device("cpu")
@@ -109,14 +121,20 @@ def test_on_the_cpu_photos_are_a_plain_list(scene, tmp_path):
     assert [k is not None for k in data.user_keep] == [v.name == "train_1.png" for v in scene.train]
 
 
-@pytest.mark.parametrize("copies", [FileReads, SlowCopies])
-def test_photos_that_do_not_fit_are_brought_when_they_are_read(scene, tmp_path, monkeypatch, copies):
-    resident, asked = load(scene, tmp_path).photos, []
-    monkeypatch.setattr(data_module, "fit", lambda needed, device: asked.append(needed))
-    monkeypatch.setattr(data_module, "FileReads", copies)
+@pytest.mark.parametrize(
+    ("copies", "memory", "held"), [(HostReads, 5.0, 6), (HostReads, 0.6, 2), (SlowCopies, 0.6, 6)]
+)
+def test_photos_that_do_not_fit_are_brought_when_they_are_read(
+    scene, tmp_path, monkeypatch, copies, memory, held
+):
+    """Of a machine with room for some photos as codes: the others are read from their files again."""
+    resident = load(scene, tmp_path).photos
+    codes = 48 * 64 * 3
+    monkeypatch.setattr(data_module, "usable_memory", lambda: memory * 4 * codes / RESIDENT)
+    monkeypatch.setattr(data_module, "HostReads", copies)
     photos = load(scene, tmp_path).photos
-    assert asked == [6 * 48 * 64 * 3 * 4] == [sum(p.nbytes for p in resident)]
     assert isinstance(photos._copies, copies)
+    assert sum(not isinstance(kept, Path) for kept in photos._held) == held
     for k, (a, b) in enumerate(zip(photos, resident, strict=True)):
         photos.prefetch((k + 1) % 6)
         assert torch.equal(a, b)
@@ -130,7 +148,7 @@ def test_what_is_held_for_a_gpu_are_the_codes_of_the_file(codes, tmp_path):
 
 
 def test_a_photo_that_has_gone_is_named_when_it_is_read(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(data_module, "RESIDENT", 0.0)
+    monkeypatch.setattr(data_module, "usable_memory", lambda: 0)
     photos = load(scene, tmp_path).photos
     scene.train[2].image_path.unlink()
     assert photos[1].shape == (48, 64, 3)
@@ -140,6 +158,24 @@ def test_a_photo_that_has_gone_is_named_when_it_is_read(scene, tmp_path, monkeyp
 
 def test_a_share_of_the_memory_decides(monkeypatch):
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 8000))
-    assert fit(250, torch.device("cuda")) and not fit(251, torch.device("cuda"))
+    assert room(torch.device("cuda")) == 250
     monkeypatch.setattr(os, "sysconf", {"SC_PAGE_SIZE": 10, "SC_PHYS_PAGES": 100}.__getitem__)
-    assert fit(250, CPU) and not fit(251, CPU)
+    assert (room(CPU), room(CPU, RESIDENT)) == (50, 250)
+
+
+def test_keep_maps_take_a_byte_a_pixel_and_are_read_as_float32():
+    maps = [None, torch.tensor([[0.0, 1.0], [-1.0, 0.0]]), torch.ones(3, 2)]
+    kept = KeepMaps(maps)
+    assert len(kept) == 3 and kept[0] is None and kept._codes[2].nbytes == 6
+    assert all(
+        torch.equal(a, b) and a.dtype == torch.float32 for a, b in zip(kept[1:], maps[1:], strict=True)
+    )
+
+
+def test_smaller_photos_are_kept_at_the_present_size_alone(scene, tmp_path):
+    data = load(scene, tmp_path)
+    pyramid = Pyramid(data)
+    quarter = pyramid.photo(0, 4)
+    assert pyramid.photo(0, 4) is quarter and quarter.shape == (12, 16, 3)
+    assert torch.equal(pyramid.photo(1, 2), shrink(data.photos[1], 2)) and list(pyramid._photos) == [1]
+    assert pyramid.photo(0, 1) is data.photos[0]

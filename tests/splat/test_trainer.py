@@ -294,7 +294,7 @@ def test_a_users_mask_is_obeyed(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path)
     user = torch.ones(trainer.data.photos[0].shape[:2])
     user[:10] = 0
-    trainer.data.user_keep[0] = user
+    trainer.data = replace(trainer.data, user_keep=[user, *trainer.data.user_keep[1:]])
     step = trainer.make_step(1, 0)
     assert torch.equal(trainer.combine_user_keep(step, None), user)
     half = torch.full_like(user, 0.5)

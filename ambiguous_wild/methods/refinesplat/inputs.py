@@ -19,7 +19,7 @@ from ambiguous_wild.methods.refinesplat.identity import (
     psi_from_arrays,
     train_psi,
 )
-from ambiguous_wild.methods.refinesplat.masks import instance_means
+from ambiguous_wild.methods.refinesplat.masks import instance_means, smallest_type
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.vision.mask_ops import add_new
@@ -55,7 +55,7 @@ class FrozenInputs:
         own = segmented.labels
         # ids of a whole scene have gaps in a photo: labels count from 1, and `_ids` holds their ids
         compact = [_compact(label) for label in own] if segmented.scene_wide else []
-        self.labels = [label for label, _ in compact] if compact else own  # [H, W] int32, 0 = none
+        self.labels = [label for label, _ in compact] if compact else own  # [H, W] int, 0 = none
         self._ids = [ids for _, ids in compact]
         # [H, W] int32 of each photo: instances that a tracker left out, with labels above its own
         self._added: list[np.ndarray] = []
@@ -65,6 +65,8 @@ class FrozenInputs:
             self._added = [untracked(label, all_found) for label, all_found in zip(self.labels, everything)]
             self.labels = [np.maximum(label, added) for label, added in zip(self.labels, self._added)]
         self.counts = [max(int(label.max(initial=0)), 0) for label in self.labels]  # K of each photo
+        kind = smallest_type(max(self.counts, default=0))
+        self.labels = [np.maximum(label, 0).astype(kind) for label in self.labels]
         # [K] bool of each photo: instances that structure from motion shows to be static
         self.static = static_instances(
             self.labels, self.counts, train_tracks(data.scene), config.mask.static_tracks

@@ -5,7 +5,7 @@ No count is read on the host.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,32 +24,66 @@ def sized(array: np.ndarray, device: torch.device | str) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(device)
 
 
-class MapStack:
-    """Maps [views, channels, h, w] float32; smaller maps lie at the upper left, the rest is padding."""
+class EnlargedMaps:
+    """Maps at the size of the photos that the host makes of small ones, each when it is read.
 
-    def __init__(self, maps: Sequence[np.ndarray], device: torch.device | str, pad: str = "zero") -> None:
+    On a GPU the large ones are kept, because to send one makes the host wait.
+    """
+
+    def __init__(
+        self, enlarge: Callable[[int], np.ndarray | None], views: int, device: torch.device | str
+    ) -> None:
         """
         Args:
-            maps: map of each view, [channels, h, w].
+            enlarge: makes the map of a view; None if it has none.
+            views: number of views.
+            device: where maps are read.
+        """
+        self._enlarge, self._device = enlarge, device
+        self._kept: list[Tensor | None] = []
+        if not backend_of(device).reads_at_once:
+            self._kept = [self._made(view) for view in range(views)]
+
+    def __getitem__(self, view: int) -> Tensor | None:
+        return self._kept[view] if self._kept else self._made(view)
+
+    def _made(self, view: int) -> Tensor | None:
+        array = self._enlarge(view)
+        return None if array is None else torch.from_numpy(array).to(self._device)
+
+
+class MapStack:
+    """Maps [views, channels, h, w], at first 0; smaller ones lie at the upper left, the rest is padding."""
+
+    def __init__(
+        self,
+        sizes: Sequence[tuple[int, ...]],
+        device: torch.device | str,
+        *,
+        channels: int = 1,
+        dtype: torch.dtype = torch.float32,
+        pad: str = "zero",
+    ) -> None:
+        """
+        Args:
+            sizes: (h, w) of each view's map.
             device: device of the stack.
+            channels: channels of a map.
+            dtype: type of the values.
             pad: padding of smaller maps: `zero`, or their own `edge`.
         """
         self.edge = pad == "edge"
-        self.sizes = [m.shape[1:] for m in maps]
+        self.sizes = list(sizes)
         h, w = (max(size[axis] for size in self.sizes) for axis in (0, 1))
-        self.stack = torch.zeros((len(maps), maps[0].shape[0], h, w), device=device)
+        self.stack = torch.zeros((len(self.sizes), channels, h, w), dtype=dtype, device=device)
         # share of the stack's size that each view's map covers; None: all of it
         self.shares: Tensor | None = None
         if len(set(self.sizes)) > 1:
             shares = np.array([[size[1] / w, size[0] / h] for size in self.sizes])
             self.shares = sized(shares[:, None, None], device)
-        for view, m in enumerate(maps):
-            for channel, plane in enumerate(m):
-                if plane.any():
-                    self.put(view, sized(plane, device), channel)
 
     def put(self, view: int, plane: Tensor, channel: int = 0) -> None:
-        """Set one channel [h, w] of a view's map."""
+        """Set one channel [h, w] float32 of a view's map."""
         h, w = self.sizes[view]
         target = self.stack[view, channel]
         if self.edge and target.shape != plane.shape:
@@ -69,10 +103,17 @@ class MapStack:
             return np.ones((len(self.sizes), 2), np.float32)
         return self.shares.cpu().numpy().reshape(-1, 2)
 
-    def select(self, views: Tensor) -> Selected:
-        """Copy the maps of views [n] int64."""
+    def select(self, views: Tensor, *others: MapStack) -> Selected:
+        """Copy the maps of views [n] int64, float32; channels of other stacks of the same sizes follow."""
         shares = None if self.shares is None else self.shares.index_select(0, views)
-        return Selected(self.stack.index_select(0, views), shares)
+        maps = [stack.stack.index_select(0, views) for stack in (self, *others)]
+        if not others:
+            return Selected(maps[0], shares)
+        n, _, h, w = maps[0].shape
+        joined = torch.empty((n, sum(m.shape[1] for m in maps), h, w), device=maps[0].device)
+        for part, m in zip(joined.split([m.shape[1] for m in maps], 1), maps):
+            part.copy_(m)
+        return Selected(joined, shares)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ def panels(
     store: MaskStore,
     step: Step,
     photo: np.ndarray,  # [H, W, 3] uint8
-    labels: np.ndarray,  # [H, W] int32, its instances
+    labels: np.ndarray,  # [H, W] int, its instances
     points: MotionPoints | None = None,  # its moving and static features
     *,
     begun: bool = True,
@@ -69,7 +69,7 @@ def reasons(store: MaskStore, view: int, maps: Maps, masks: PhotoMasks) -> MaskR
     sentence is its mean, and the threshold that of the scene's instances.
     """
     config = store.limited.get(view, store.config.mask)
-    labels = store.labels.of_pixel[view].view(store.labels.shapes[view])
+    labels = store.labels.of_pixel(view).view(store.labels.shapes[view])
     judged, threshold = _judged(store, view, maps, masks), float(masks.cut.threshold)
     structure, fused = config.statistic == "structure", _is_fused(config)
     masked = masks.keep < 0.5
@@ -101,9 +101,10 @@ def reasons(store: MaskStore, view: int, maps: Maps, masks: PhotoMasks) -> MaskR
     static, seen = store.labels.static.get(view), store.pixels.seen[view]
     if static is not None:
         add(static & ~masked, "kept: structure from motion shows that its region does not move")
-    if view in store.maskable:
+    maskable = store.maskable[view]
+    if maskable is not None:
         found = "other parts of this photo were found to move before training, and only those are masked"
-        add(~store.maskable[view], f"kept: {found}")
+        add(~maskable, f"kept: {found}")
     if structure and seen is not None:
         add(~seen, "kept: too few other photos see this surface")
     regions = (labels.long().clamp(min=0) * len(sentences) + kinds).cpu().numpy()
@@ -126,7 +127,7 @@ def _judged(store: MaskStore, view: int, maps: Maps, masks: PhotoMasks) -> Tenso
     of_instance = store.labels.on_pixels(view, masks.means.nan_to_num(nan=0.0), shape)
     if not _is_fused(store.config.mask):
         return torch.where(masks.local, of_instance, own.double())
-    inside = store.labels.of_pixel[view].view(shape) > 0
+    inside = store.labels.of_pixel(view).view(shape) > 0
     return torch.where(inside, (own * of_instance).clamp(min=0.0).sqrt(), own.double())
 
 
@@ -138,15 +139,15 @@ def explain(store: MaskStore, step: Step, x: int, y: int) -> list[str]:
     structure, seen = config.statistic == "structure", store.pixels.seen[view]
     if structure and seen is not None and not bool(seen[y, x]):
         return []
-    if view in store.maskable and not bool(store.maskable[view][y, x]):
+    maskable, weight = store.maskable[view], store.factors[view]
+    if maskable is not None and not bool(maskable[y, x]):
         return []
     own = float(enlarge(maps.statistic, *shape)[y, x])
     what = "difference in structure, in units of what noise causes" if structure else config.statistic
     lines = [f"evidence of the pixel: {own:.2f} ({what})"]
-    if structure and view in store.factors:
-        factor = float(store.factors[view][y, x])
-        lines.append(f"in it, first look at the photos before training: times {factor:.2f}")
-    labels = store.labels.of_pixel[view].view(shape)
+    if structure and weight is not None:
+        lines.append(f"in it, first look at the photos before training: times {float(weight[y, x]):.2f}")
+    labels = store.labels.of_pixel(view).view(shape)
     instance = int(labels[y, x])
     if instance > 0:
         mean, pixels = float(masks.means[instance - 1]), int((labels == instance).sum())

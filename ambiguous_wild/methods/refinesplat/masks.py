@@ -8,7 +8,7 @@ pictures read values.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,7 +20,7 @@ from torch import Tensor
 from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.refinesplat.evidence import Maps, global_of, scaled_by
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.maps import sized, spread_of
+from ambiguous_wild.methods.refinesplat.maps import EnlargedMaps, spread_of
 from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPrior
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence, grown, hysteresis
 from ambiguous_wild.methods.refinesplat.threshold import InstanceStats, Threshold, learnt, pool_of, t_ent
@@ -73,13 +73,13 @@ def instance_means(grid: Tensor, labels: Tensor, count: int) -> tuple[Tensor, Te
 
     Args:
         grid: [h, w], e.g. the entropy map.
-        labels: [H, W] int32, instances from 1; 0 and negative labels are none.
+        labels: [H, W] int, instances from 1; 0 and negative labels are none.
         count: number of labels.
 
     Returns:
         means [count] float64 (NaN for a label without pixels), areas [count] px, float64.
     """
-    flat, backend = labels.clamp(min=0).flatten(), backend_of(labels.device)
+    flat, backend = labels.int().clamp(min=0).flatten(), backend_of(labels.device)
     areas = backend.label_sums(flat, count + 1)[1 : count + 1]
     values = enlarge(grid.double(), *labels.shape).flatten()
     sums = backend.label_sums(flat, count + 1, values)[1 : count + 1]
@@ -91,19 +91,19 @@ class Labels:
 
     def __init__(
         self,
-        labels: Sequence[np.ndarray],  # [H, W] int32, 0 = none
+        labels: Sequence[np.ndarray],  # [H, W] int, 0 = none
         static: Sequence[np.ndarray],  # [K of the photo] bool, must not be masked
-        unseen: Sequence[np.ndarray | None],  # [H, W] bool, must not be judged
+        seen: Iterable[np.ndarray | None],  # [H, W] bool, may be judged
         device: torch.device | str,
     ) -> None:
         self.shapes = [label.shape for label in labels]
         counts = [len(s) for s in static]
         self.most = max([*counts, 1])
         clean = [
-            np.where((label > 0) & (True if u is None else ~u), label, 0)
-            for label, u in zip(labels, unseen, strict=True)
+            np.where((label > 0) & (True if s is None else s), label, 0).astype(smallest_type(self.most))
+            for label, s in zip(labels, seen, strict=True)
         ]
-        self.of_pixel = [torch.from_numpy(label.astype(np.int32).ravel()).to(device) for label in clean]
+        self._of_pixel = [torch.from_numpy(label.ravel()).to(device) for label in clean]
         areas = np.full((len(clean), self.most), np.nan)
         flags = np.zeros((len(clean), self.most), bool)
         for view, (label, count) in enumerate(zip(clean, counts)):
@@ -120,15 +120,24 @@ class Labels:
             if flags[view].any()
         }
 
+    def of_pixel(self, view: int) -> Tensor:
+        """Return the label of each pixel, [H * W] int32; 0 = none."""
+        return self._of_pixel[view].int()
+
     def means(self, view: int, pixels: Tensor) -> Tensor:
         """Return the mean of a map [H, W] over every instance, [K] float64; NaN for missing ones."""
         backend = backend_of(pixels.device)
-        sums = backend.label_sums(self.of_pixel[view], self.most + 1, pixels.double().flatten())
+        sums = backend.label_sums(self.of_pixel(view), self.most + 1, pixels.double().flatten())
         return sums[1:] / self.areas[view]
 
     def on_pixels(self, view: int, values: Tensor, shape: tuple[int, ...]) -> Tensor:
         """Return the value of each instance [K] at its pixels [H, W]; 0 outside of instances."""
-        return F.pad(values, (1, 0)).index_select(0, self.of_pixel[view]).view(shape)
+        return F.pad(values, (1, 0)).index_select(0, self.of_pixel(view)).view(shape)
+
+
+def smallest_type(most: int) -> type[np.uint8 | np.int32]:
+    """Return the type in which labels up to `most` take least memory."""
+    return np.uint8 if most < 256 else np.int32
 
 
 def make_masks(
@@ -180,7 +189,7 @@ def make_masks(
     if fused:
         of_instance = labels.on_pixels(view, means.nan_to_num(nan=0.0), shape)
         # a pixel without an instance is judged alone
-        inside = labels.of_pixel[view].view(shape) > 0
+        inside = labels.of_pixel(view).view(shape) > 0
         judging = torch.where(inside, (pixels * of_instance).sqrt_(), pixels)
         regions.append(judging)
     # the default settings compute two sets of regions at once
@@ -216,7 +225,7 @@ class MaskStore:
         data: TrainData,
         surfaces: Sequence[np.ndarray | None],  # inverse depths of the sparse points
         looks: Mapping[int, InitialMaskPrior],
-        labels: Sequence[np.ndarray],  # [H, W] int32 instances, 0 = none
+        labels: Sequence[np.ndarray],  # [H, W] int instances, 0 = none
         static: Sequence[np.ndarray],  # [K of the photo] bool, not to be masked
         compare: Callable[[Step], Maps],  # on the feature grid; called only if the statistic needs it
     ) -> None:
@@ -225,21 +234,25 @@ class MaskStore:
         self.pixels = PixelEvidence(photos, cameras, surfaces, config.mask, device)
         structure = config.mask.statistic == "structure"
         # features are judged on their whole grid
-        unseen = self.pixels.unseen_on_host if structure else [None] * len(photos)
-        self.labels = Labels(labels, static, unseen, device)
+        judged = (self.pixels.seen[view] if structure else None for view in range(len(photos)))
+        self.labels = Labels(labels, static, (None if s is None else s.cpu().numpy() for s in judged), device)
         sizes = [(camera.height, camera.width) for camera in cameras]
-        # view -> factor of its evidence, [H, W]; absent if it is 1
-        self.factors = {
-            view: sized(look.factor(sizes[view]), device) for view, look in looks.items() if look.weight != 1
-        }
-        # view -> pixels that may be masked, [H, W] bool; absent if all may
-        self.maskable = {
-            view: torch.from_numpy(~keep).to(device)
-            for view, look in looks.items()
-            if look.within and (keep := look.keep(sizes[view])) is not None
-        }
+
+        def factor(view: int) -> np.ndarray | None:
+            look = looks.get(view)
+            return None if look is None or look.weight == 1 else look.factor(sizes[view])
+
+        def maskable(view: int) -> np.ndarray | None:
+            look = looks.get(view)
+            keep = None if look is None or not look.within else look.keep(sizes[view])
+            return None if keep is None else ~keep
+
+        # factor of the evidence of each view, [H, W]; None if it is 1
+        self.factors = EnlargedMaps(factor, len(photos), device)
+        # pixels of each view that may be masked, [H, W] bool; None if all may
+        self.maskable = EnlargedMaps(maskable, len(photos), device)
         self.limited = {view: config.mask.limited(look.most) for view, look in looks.items()}
-        self.keeps: dict[int, Tensor] = {}  # view -> its keep map [H, W] float32, if it has one
+        self.keeps: dict[int, Tensor] = {}  # view -> its keep map [H, W] uint8, if it has one
         wide, views = torch.float64, len(photos)
         # [views, K] mean of every instance when its mask was last made, NaN for missing ones
         self.means = torch.full((views, self.labels.most), torch.nan, dtype=wide, device=device)
@@ -257,7 +270,7 @@ class MaskStore:
         self.distances[view].copy_(masks.distances)
         if config.w2 is None:
             self._learn(view, masks)
-        self.keeps[view] = masks.keep
+        self.keeps[view] = masks.keep.to(torch.uint8)
         self._shares[view].copy_(masks.shares())
 
     def _learn(self, view: int, masks: PhotoMasks) -> None:
@@ -289,16 +302,17 @@ class MaskStore:
         if mask.statistic == "structure":
             image, alpha, depth = (t.detach() for t in (rendered.image, rendered.alpha, rendered.depth))
             evidence, unit = self.pixels.look(view, image, alpha, depth, remember=remember)
-            if view in self.factors:
-                evidence = evidence * self.factors[view]
+            factor = self.factors[view]
+            if factor is not None:
+                evidence = evidence * factor
             if mask.entropy_weight > 0:
                 evidence = scaled_by(evidence, self.compare(step).statistic, mask.entropy_weight)
             maps = Maps(evidence, evidence)
             maskable, ceiling = self.pixels.seen[view], self.pixels.ceiling(unit)
         else:
             maps = self.compare(step)
-        if view in self.maskable:
-            crowd = self.maskable[view]
+        crowd = self.maskable[view]
+        if crowd is not None:
             maskable = crowd if maskable is None else maskable & crowd
         w2 = torch.sigmoid(self.theta) if mask.w2 is None else mask.w2
         others = self.means, self.distances
@@ -324,7 +338,7 @@ class MaskStore:
 
     def state_dict(self) -> State:
         return {
-            "keeps": {str(view): (keep > 0.5).to(torch.uint8) for view, keep in self.keeps.items()},
+            "keeps": {str(view): keep for view, keep in self.keeps.items()},
             # stored as text: T_ent is inf if no instance is an outlier, and JSON has no inf
             "shares": {str(view): [repr(x) for x in row] for view, row in self.shares.items()},
             "judged": {
@@ -343,7 +357,7 @@ class MaskStore:
         rows = np.full((2, *self.means.shape), np.nan)
         for view, statistics in state["judged"].items():
             rows[:, int(view), self.labels.known[int(view)]] = statistics[:2].cpu().numpy()
-        self.keeps = {int(v): keep.float().to(device) for v, keep in state["keeps"].items()}
+        self.keeps = {int(v): keep.to(device) for v, keep in state["keeps"].items()}
         self._shares = torch.from_numpy(shares).to(device)
         same = self.distances is self.means
         self.means = torch.from_numpy(rows[0]).to(device)

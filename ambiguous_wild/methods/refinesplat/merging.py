@@ -26,7 +26,10 @@ from ambiguous_wild.splat.gaussians import SH_C0, Gaussians, rotation_matrices
 
 Overlap = Literal["normalised", "literal"]
 EIGEN_FLOOR = 1e-14  # least eigenvalue, as a share of the largest: needles up to 1e7 to 1
-_PAIRS = 2**20  # pairs whose overlaps are computed at a time
+_PAIRS = 2**16  # pairs whose overlaps are computed at a time, 1.2 kB each
+# Matrices that are decomposed at a time: cuSOLVER refuses above about 32 000, and its workspace grows with
+# their number.
+_MATRICES = 2**10
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ def merge_pairs(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -
     rows = torch.nonzero(candidates).squeeze(1)
     if len(rows) < 2:
         return rows.new_zeros((0, 2))
-    chosen = gaussians.select(rows)
+    chosen = gaussians.of_degree(0).select(rows)  # higher harmonics are not compared
     # many centres coincide after cloning: a point itself may not be among its neighbours
     near = backend_of(rows.device).neighbours(chosen.means, min(config.neighbours + 1, len(rows)))
     i = torch.arange(len(rows), device=rows.device)[:, None].expand_as(near)
@@ -246,7 +249,8 @@ def merge_members(members: Gaussians, cluster: Tensor) -> Gaussians:
 
 def scale_rotation(cov: Tensor) -> tuple[Tensor, Tensor]:
     """Return log_scales [n, 3] and quats [n, 4] (w, x, y, z) of covariances [n, 3, 3]."""
-    values, vectors = torch.linalg.eigh(cov)
+    parts = [torch.linalg.eigh(part) for part in cov.split(_MATRICES)]
+    values, vectors = (torch.cat(part) for part in zip(*parts))
     values = torch.maximum(values, values[:, 2:].clamp(min=1e-300) * EIGEN_FLOOR)
     flip = torch.where(torch.linalg.det(vectors) < 0, -1.0, 1.0).to(vectors)
     vectors = torch.cat([vectors[:, :, :1] * flip[:, None, None], vectors[:, :, 1:]], 2)

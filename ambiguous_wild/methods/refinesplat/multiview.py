@@ -37,6 +37,7 @@ from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.methods.refinesplat.maps import (
     FAR_MORE,
     WHITE,
+    EnlargedMaps,
     MapStack,
     Ranks,
     Selected,
@@ -102,7 +103,6 @@ class _Query:
     origin: Tensor  # [n, 3, 1]
     x: Tensor  # [w] coordinates of its rays at depth 1
     y: Tensor  # [h, 1]
-    sparse_depth: Tensor | None  # [h, w], depth of the sparse points' surface, NaN if none
     shrink: tuple[Tensor, Tensor]  # matrices that shrink its evidence, [h, H], [W, w], see `blur_and_shrink`
 
 
@@ -128,7 +128,7 @@ class _Answers:
 
 
 class OtherViews:
-    """The last evidence of every view about the surfaces it shows, in three stacks of maps."""
+    """The last evidence of every view about the surfaces it shows, in four stacks of maps."""
 
     def __init__(
         self,
@@ -144,18 +144,20 @@ class OtherViews:
         self.near = near = nearest_views(cameras, config.views)
         self.count = len(near[0])
         self.ranks = Ranks(self.count, config.quantile, device)
-        # evidence, and colours from 0 to 255
-        stored = [
-            np.concatenate([np.zeros((1, *size), np.float32), np.moveaxis(colours, 2, 0).astype(np.float32)])
-            for size, photo, camera in zip(self.sizes, photos, cameras, strict=True)
-            for colours in [small_colours(photo, half_size(camera))]
-        ]
-        self.stored = MapStack(stored, device, pad="edge")
-        self.depth = MapStack([np.zeros((1, *size), np.float32) for size in self.sizes], device)
+        self.evidence = MapStack(self.sizes, device, pad="edge")
+        # from 0 to 255
+        self.colours = MapStack(self.sizes, device, channels=3, dtype=torch.uint8, pad="edge")
+        for view, (photo, camera) in enumerate(zip(photos, cameras, strict=True)):
+            for channel, plane in enumerate(np.moveaxis(small_colours(photo, half_size(camera)), 2, 0)):
+                self.colours.put(view, sized(plane, device), channel)
+        self.depth = MapStack(self.sizes, device)
         # copied to `surface` once the view has stored evidence, like its depth
         self.known_surfaces = [None if s is None else sized(_depths(s), device) for s in sparse]
-        blank = np.zeros((1, 1), np.float32)
-        self.surface = MapStack([np.zeros_like(blank if s is None else s)[None] for s in sparse], device)
+        self.surface = MapStack([(1, 1) if s is None else s.shape for s in sparse], device)
+        # depth of the sparse points' surface of each view, [h, w], NaN if none
+        self.sparse_depth = EnlargedMaps(
+            lambda view: _at_depth(sparse[view], self.sizes[view]), len(cameras), device
+        )
         self.stored_views: set[int] = set()  # views with stored evidence
         # made once for each size, because they take as much memory as the maps
         shrinks: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
@@ -171,7 +173,6 @@ class OtherViews:
                 cameras,
                 near[view],
                 self.sizes[view],
-                sparse[view],
                 shrinks[camera.height, camera.width],
             )
             for view, camera in enumerate(cameras)
@@ -191,14 +192,14 @@ class OtherViews:
         rows, columns = self.queries[view].shrink
         with torch_threads(1):
             small = rows @ evidence @ columns
-        self.stored.put(view, small, channel=0)
+        self.evidence.put(view, small)
         self.depth.put(view, depth)
         self._mark_known(view)
 
     def restore(self, evidence: dict[int, Tensor], depth: dict[int, Tensor]) -> None:
         """Restore the evidence of views from a checkpoint, [h, w] at half their photos' size."""
         for view, stored in evidence.items():
-            self.stored.put(view, stored, channel=0)
+            self.evidence.put(view, stored)
             self.depth.put(view, depth[view])
             self._mark_known(view)
 
@@ -226,12 +227,13 @@ class OtherViews:
         least = min(config.seen_by, len(self.stored_views.intersection(self.near[view])))
         if backend_of(depth.device).kernels:
             return MultiViewEvidence(*self._ask_kernels(view, depth, least))
-        stacks = self.stored, self.depth, self.surface
         points = _NeighbourRays(
             torch.addcmul(torch.addcmul(own.ahead, own.down, own.y), own.right, own.x).flatten(2),
             own.origin,
-            self.stored.of(view)[1:].flatten(1),
-            *(stack.select(own.neighbours) for stack in stacks),
+            self.colours.of(view).flatten(1).float(),
+            self.evidence.select(own.neighbours, self.colours),
+            self.depth.select(own.neighbours),
+            self.surface.select(own.neighbours),
         )
         answers, difference = self._look_up(points, slice(None), depth.flatten())
         offset = None
@@ -240,8 +242,9 @@ class OtherViews:
             offset = common_offset(some, same, config.agree)
             answers = replace(answers, agree=agree(difference, answers.same, config.agree, offset))
         few = answers.same.sum(0) < config.known_by
-        if own.sparse_depth is not None:
-            self._look_up_sparse(points, own.sparse_depth.flatten(), answers, few, offset)
+        sparse_depth = self.sparse_depth[view]
+        if sparse_depth is not None:
+            self._look_up_sparse(points, sparse_depth.flatten(), answers, few, offset)
         seen = answers.same.sum(0)
         weight = agreement_weight(seen, answers.agree.sum(0), config.agreeing, few)
         evidence = self.ranks.quantile_of(answers.evidence, seen)
@@ -253,8 +256,9 @@ class OtherViews:
         """Return evidence, weight and coverage [3, h, w] by the kernels of the CPU."""
         own, config = self.queries[view], self.config
         n, (h, w) = self.count, depth.shape
-        stored, depths, surfaces = (s.stack.numpy() for s in (self.stored, self.depth, self.surface))
-        shares, surface_shares = (s.shares_of_views() for s in (self.stored, self.surface))
+        evidences, colours = self.evidence.stack.numpy(), self.colours.stack.numpy()
+        depths, surfaces = self.depth.stack.numpy(), self.surface.stack.numpy()
+        shares, surface_shares = (s.shares_of_views() for s in (self.evidence, self.surface))
         rays = own.frames, own.x.numpy(), own.y.numpy().ravel()
         near, of = own.neighbours.numpy(), np.float32
         apart = of(3.0 * config.agree * WHITE)
@@ -263,11 +267,12 @@ class OtherViews:
         difference, offset = np.empty((n, h, w, 3), np.float32), np.zeros((n, 3), np.float32)
         counts, out = np.zeros((n, 3, COLOURS), np.int64), np.empty((3, h, w), np.float32)
         found = evidence, same, difference, offset
-        look_up(*rays, depth.numpy(), near, view, stored, depths, shares, rules, counts, *found)
-        sparse = np.empty((0, 0), np.float32) if own.sparse_depth is None else own.sparse_depth.numpy()
+        look_up(*rays, depth.numpy(), near, view, evidences, colours, depths, shares, rules, counts, *found)
+        sparse_depth = self.sparse_depth[view]
+        sparse = np.empty((0, 0), np.float32) if sparse_depth is None else sparse_depth.numpy()
         combine(
-            *rays, sparse, near, view, stored, depths, surfaces, shares, surface_shares, rules, least,
-            self.ranks.pair.numpy(), self.ranks.share.numpy(), *found, out,
+            *rays, sparse, near, view, evidences, colours, depths, surfaces, shares, surface_shares,
+            rules, least, self.ranks.pair.numpy(), self.ranks.share.numpy(), *found, out,
         )  # fmt: skip
         return torch.from_numpy(out)
 
@@ -364,7 +369,6 @@ def _query_of(
     cameras: Sequence[Camera],
     near: Sequence[int],
     size: tuple[int, int],
-    inverse: np.ndarray | None,
     shrink: tuple[Tensor, Tensor],
 ) -> _Query:
     camera, (h, w), device = cameras[view], size, shrink[0].device
@@ -379,10 +383,6 @@ def _query_of(
     right, down, ahead = (sized(frames[:, :, k, None, None], device) for k in range(3))
     x = ((np.arange(w) + 0.5) * (camera.width / w) - camera.cx) / camera.fx
     y = ((np.arange(h) + 0.5) * (camera.height / h) - camera.cy) / camera.fy
-    sparse = None
-    if inverse is not None:
-        with np.errstate(divide="ignore"):
-            sparse = 1.0 / cv2.resize(inverse, (w, h), interpolation=cv2.INTER_NEAREST)
     return _Query(
         neighbours=torch.from_numpy(np.array(near, np.int64)).to(device),
         frames=frames.astype(np.float32),
@@ -392,7 +392,6 @@ def _query_of(
         origin=sized(frames[:, :, 3:], device),
         x=sized(x, device),
         y=sized(y[:, None], device),
-        sparse_depth=None if sparse is None else sized(sparse, device),
         shrink=shrink,
     )
 
@@ -401,6 +400,14 @@ def _depths(inverse: np.ndarray) -> np.ndarray:
     """Return the depths of a map of inverse depths, float32; 0 where unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(inverse > 0, 1.0 / inverse, 0.0).astype(np.float32)
+
+
+def _at_depth(inverse: np.ndarray | None, size: tuple[int, int]) -> np.ndarray | None:
+    """Return the depths [h, w] of a map of inverse depths, NaN where unknown."""
+    if inverse is None:
+        return None
+    with np.errstate(divide="ignore"):
+        return 1.0 / cv2.resize(inverse, size[::-1], interpolation=cv2.INTER_NEAREST)
 
 
 def half_size(camera: Camera) -> tuple[int, int]:

@@ -25,7 +25,7 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
-from ambiguous_wild.methods.refinesplat.maps import low_quantile, median
+from ambiguous_wild.methods.refinesplat.maps import EnlargedMaps, low_quantile, median
 from ambiguous_wild.methods.refinesplat.multiview import OtherViews, discount
 from ambiguous_wild.methods.refinesplat.structure import structure_residual, unrelated_residual
 from ambiguous_wild.splat.backend import backend_of
@@ -161,16 +161,13 @@ class PixelEvidence:
         self.photos = photos
         on_host = (photo.cpu().numpy() for photo in photos)  # one at a time: all may not fit
         self.other_views = OtherViews(cameras, on_host, config.multiview, surfaces, device)
-        self.unseen_on_host = [
-            None if few is None or not few.any() else _at_size(few, (camera.height, camera.width))
-            for few, camera in zip(
-                seldom_seen(cameras, surfaces, config.multiview.seen_by) or [None] * len(cameras), cameras
-            )
-        ]
+        unseen = seldom_seen(cameras, surfaces, config.multiview.seen_by) or [None] * len(cameras)
         # [H, W] bool of each view: pixels that enough other photos see; None: all
-        self.seen = [
-            None if unseen is None else torch.from_numpy(~unseen).to(device) for unseen in self.unseen_on_host
-        ]
+        self.seen = EnlargedMaps(
+            lambda view: _seen(unseen[view], (cameras[view].height, cameras[view].width)),
+            len(cameras),
+            device,
+        )
         self.unrelated = unrelated_residual(photos, config.base)
         # normal residual of each view's static pixels; NaN before the first `look`
         self.normal = torch.full((len(photos),), torch.nan, dtype=torch.float64, device=device)
@@ -238,7 +235,7 @@ class PixelEvidence:
         return {
             "normal": {str(v): x for v, x in enumerate(normal) if not math.isnan(x)},
             "before": {str(v): x.cpu() for v, x in self.before.items()},
-            "evidence": {str(v): others.stored.of(v)[0].cpu().contiguous() for v in views},
+            "evidence": {str(v): others.evidence.of(v)[0].cpu().contiguous() for v in views},
             "depth": {str(v): others.depth.of(v)[0].cpu().contiguous() for v in views},
         }
 
@@ -255,6 +252,8 @@ class PixelEvidence:
         )
 
 
-def _at_size(few: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Enlarge a coarse bool map to the size of a photo of this size (height, width)."""
-    return cv2.resize(few.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0
+def _seen(unseen: np.ndarray | None, size: tuple[int, int]) -> np.ndarray | None:
+    """Return where a photo of this size (height, width) is seen, from a coarse bool map; None: everywhere."""
+    if unseen is None or not unseen.any():
+        return None
+    return cv2.resize(unseen.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) == 0

@@ -26,6 +26,7 @@ from ambiguous_wild.methods.refinesplat.density_control import EntropyAwareDensi
 from ambiguous_wild.methods.refinesplat.evidence import Maps, compare, silence
 from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
+from ambiguous_wild.methods.refinesplat.maps import EnlargedMaps
 from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPrior, initial_mask_prior, masked_share
 from ambiguous_wild.methods.refinesplat.masks import MaskStore
 from ambiguous_wild.methods.refinesplat.threshold import Variant
@@ -142,12 +143,12 @@ class RefineSplatMask(PausingMask):
             self.looks = {view: look for view, look in enumerate(looks) if look is not None}
         labels, static = self.inputs.labels, self.inputs.static
         self.masks = MaskStore(config, data, surfaces, self.looks, labels, static, self.compare)
-        # view -> its keep map before masks begin, [H, W] float32; absent if everything is kept
-        self.first = {
-            view: torch.from_numpy(keep.astype(np.float32)).to(data.device)
-            for view, look in self.looks.items()
-            if (keep := look.keep((data.cameras[view].height, data.cameras[view].width))) is not None
-        }
+        # keep map of each view before masks begin, [H, W] bool; None if everything is kept
+        self.first = EnlargedMaps(self._first_keep, len(data.photos), data.device)
+
+    def _first_keep(self, view: int) -> np.ndarray | None:
+        look, camera = self.looks.get(view), self.data.cameras[view]
+        return None if look is None else look.keep((camera.height, camera.width))
 
     def _moving(self, surfaces: list[np.ndarray | None]) -> list[np.ndarray | None]:
         """Return what moves in each photo, in the shape of its surface; None if unknown."""
@@ -157,23 +158,25 @@ class RefineSplatMask(PausingMask):
         for k, (view, surface) in enumerate(zip(data.scene.train, surfaces, strict=True)):
             of_photo, photo, labels = points.get(view.name), data.photos[k], self.inputs.labels[k]
             if of_photo is not None and surface is not None:
+                labels = labels.astype(np.int32)
                 labels = moving_labels(self.instances, photo, labels, of_photo, data.cache_dir)
                 by_photo[k] = moving_map(of_photo, labels, surface.shape)
         return by_photo
 
     def keep(self, step: Step) -> Tensor | None:
         if not self.begun(step):
-            first = self.first.get(step.view)
-            return None if first is None else shrink_keep(first, step.downsampling)
+            first = self.first[step.view]
+            return None if first is None else shrink_keep(first.float(), step.downsampling)
         visit = self.visits.get(step.view, 0)
         due = step.view not in self.masks.keeps or visit % self.config.mask_every == 0
         if due and not self.paused(step):
             self.masks.renew(step)
         self.visits[step.view] = visit + 1
-        keep = self.masks.keeps.get(step.view)
-        if keep is not None and self.config.factor == "transient":
-            keep = 1.0 - keep
-        return None if keep is None else shrink_keep(keep, step.downsampling)
+        stored = self.masks.keeps.get(step.view)
+        if stored is None:
+            return None
+        keep = stored.float()
+        return shrink_keep(1.0 - keep if self.config.factor == "transient" else keep, step.downsampling)
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Tensor | None:
         """Return d(lambda_id L_id + lambda_cr L_cr)/dimage through the frozen features and psi."""

@@ -46,19 +46,24 @@ def _is_near(stack, view, shares, place, z, depth):
 
 
 @inner_kernel
-def _read(stack, view, shares, place, out):
-    """Read the four channels of a view's map bilinearly, the border replicated; colours are rounded."""
-    height, width = stack.shape[2], stack.shape[3]
+def _mixed(plane, left, top, right, bottom, u, v):
+    above = plane[top, left] * (_ONE - u) + plane[top, right] * u
+    below = plane[bottom, left] * (_ONE - u) + plane[bottom, right] * u
+    return above * (_ONE - v) + below * v
+
+
+@inner_kernel
+def _read(evidences, colours, view, shares, place, out):
+    """Read evidence and colours of a view bilinearly, the border replicated; colours are rounded."""
+    height, width = evidences.shape[2], evidences.shape[3]
     x = min(max(_in_pixels(place[0], shares[view, 0], width), _ZERO), np.float32(width - 1))
     y = min(max(_in_pixels(place[1], shares[view, 1], height), _ZERO), np.float32(height - 1))
     left, top = np.int64(x), np.int64(y)
     right, bottom = min(left + 1, width - 1), min(top + 1, height - 1)
     u, v = x - np.float32(left), y - np.float32(top)
-    for channel in range(4):
-        above = stack[view, channel, top, left] * (_ONE - u) + stack[view, channel, top, right] * u
-        below = stack[view, channel, bottom, left] * (_ONE - u) + stack[view, channel, bottom, right] * u
-        value = above * (_ONE - v) + below * v
-        out[channel] = value if channel == 0 else np.rint(value)
+    out[0] = _mixed(evidences[view, 0], left, top, right, bottom, u, v)
+    for channel in range(3):
+        out[channel + 1] = np.rint(_mixed(colours[view, channel], left, top, right, bottom, u, v))
 
 
 @inner_kernel
@@ -80,7 +85,8 @@ def _middle(counts, rank):
 
 @parallel_kernel
 def look_up(
-    frames, x, y, depth, near, view, stored, depths, shares, rules, counts, evidence, same, difference, offset
+    frames, x, y, depth, near, view, evidences, colours, depths, shares,
+    rules, counts, evidence, same, difference, offset,
 ):  # fmt: skip
     """Look up the evidence of n neighbours about the surface at each pixel [h, w].
 
@@ -91,7 +97,8 @@ def look_up(
         depth: [h, w] of the surface.
         near: [n] numbers of the neighbours.
         view: number of the view.
-        stored: [views, 4, H, W] evidence and colours of every view.
+        evidences: [views, 1, H, W] evidence of every view.
+        colours: [views, 3, H, W] uint8, of their photos.
         depths: [views, 1, H, W] depth of the surface, 0 = none.
         shares: [views, 2] share of the stack's width and height that each map covers.
         rules: relative difference of depth up to which two views see the same surface; sum of three
@@ -109,12 +116,12 @@ def look_up(
                 same[k, row, column] = _is_near(depths, other, shares, (u, v), z, rules[0])
                 if not same[k, row, column]:
                     continue
-                _read(stored, other, shares, (u, v), read)
+                _read(evidences, colours, other, shares, (u, v), read)
                 evidence[k, row, column] = read[0]
                 sampled = row % _EVERY == 0 and column % _EVERY == 0
                 total += sampled
                 for c in range(3):
-                    away = stored[view, c + 1, row, column] - read[c + 1]
+                    away = colours[view, c, row, column] - read[c + 1]
                     difference[k, row, column, c] = away
                     if sampled:
                         counts[k, c, np.int64(away) + 255] += 1
@@ -135,8 +142,8 @@ def look_up(
 
 @parallel_kernel
 def combine(
-    frames, x, y, sparse, near, view, stored, depths, surfaces, shares, surface_shares, rules, least,
-    pair, share, evidence, same, difference, offset, out,
+    frames, x, y, sparse, near, view, evidences, colours, depths, surfaces, shares, surface_shares,
+    rules, least, pair, share, evidence, same, difference, offset, out,
 ):  # fmt: skip
     """Combine the neighbours' evidence at each pixel; that about the sparse points' surface if more see it.
 
@@ -170,9 +177,9 @@ def combine(
                     if _is_near(depths, near[k], shares, (u, v), z, rules[0]) or _is_near(
                         surfaces, near[k], surface_shares, (u, v), z, rules[0]
                     ):
-                        _read(stored, near[k], shares, (u, v), read)
+                        _read(evidences, colours, near[k], shares, (u, v), read)
                         for c in range(3):
-                            away[c] = stored[view, c + 1, row, column] - read[c + 1]
+                            away[c] = colours[view, c, row, column] - read[c + 1]
                         sparse_values[others] = read[0]
                         others += 1
                         others_agreed += _agrees(away, offset[k], rules[1])

@@ -457,7 +457,7 @@ def is_record(path: Path, key: str) -> bool:
     return key in own_json(path)
 
 
-def write_bytes(path: Path | str, parts: Iterable[bytes]) -> None:
+def write_bytes(path: Path | str, parts: Iterable[bytes | memoryview]) -> None:
     """Write the parts of a file atomically."""
     with atomic_path(path) as temporary, open(temporary, "wb") as f:
         f.writelines(parts)

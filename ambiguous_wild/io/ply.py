@@ -71,7 +71,7 @@ def write_splat_ply(
 
 def encode_ply(
     gaussians: Arrays, transform: SceneTransform = UNMOVED, antialias: bool = False
-) -> list[bytes]:
+) -> list[bytes | memoryview]:
     """Return the parts of a splat PLY, see `write_splat_ply`."""
     gaussians = rescaled(gaussians, 1 / transform.scale)
     n, rest = gaussians["sh_rest"].shape[:2]

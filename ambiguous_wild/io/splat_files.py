@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,7 +30,7 @@ class SplatFormat:
     # bytes and name of a file -> its content; AwError with the name if it is damaged
     decode: Callable[[bytes, Path], SplatFile]
     # finite Gaussians, their scene's transform, whether Mip-Splatting's filter draws them -> parts of a file
-    encode: Callable[[Arrays, SceneTransform, bool], list[bytes]]
+    encode: Callable[[Arrays, SceneTransform, bool], Sequence[bytes | memoryview]]
     ordered: bool = True  # Gaussians are written in the order of a Morton curve
     # whether it holds the sizes of a scene whose unit is 1/x of the unit of training
     holds_units: Callable[[float], bool] = lambda scale: True

@@ -89,6 +89,9 @@ def test_nothing_is_read_and_nothing_sent(scene, tmp_path, fake, method, effects
     trainer.iteration -= 1
     trainer = moved(trainer)
     steps(trainer, 2 * PHOTOS)  # what is copied once, as cameras are, is; that of a pose at its second visit
+    trainer.iteration += 5000  # smoothing copies all cameras when it is next due
+    steps(trainer, 2)
+    trainer.iteration -= 5002
     mask, reset = trainer.hooks.mask, trainer.make_step(trainer.iteration, 0)
     with no_transfers():
         steps(trainer, PHOTOS)

@@ -95,7 +95,7 @@ def prepare(source: Path, work: Path) -> int:
                 name = Path(view.name).with_suffix(".jpg").name
                 cv2.imwrite(str(folder / name), large[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
     write_scene(work / "scene", source, scene.views)
-    write_scene(work / "few", source, scene.views[:: len(scene.views) // FEW])
+    write_scene(work / "few", source, scene.views[:: max(len(scene.views) // FEW, 1)])
     if not (work / "million.ply").is_file():
         rng = np.random.default_rng(0)
         around = scene.points.xyz[rng.integers(len(scene.points), size=GAUSSIANS)]

@@ -89,9 +89,9 @@ def first_masks(data: TrainData, motion: float) -> dict[str, np.ndarray]:
     policy = RefineSplatMask(replace(config, first_look=replace(config.first_look, motion=motion, least=0.0)))
     policy.setup(data)
     return {
-        view.name: policy.first[k].numpy() < 0.5
-        if k in policy.first
-        else np.zeros(data.photos[k].shape[:2], bool)
+        view.name: np.zeros(data.photos[k].shape[:2], bool)
+        if (keep := policy.first[k]) is None
+        else keep.numpy() < 0.5
         for k, view in enumerate(data.scene.train)
     }
 

@@ -7,6 +7,7 @@ the static scene; photos that show what lies behind their 3D points reveal them.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,13 +17,16 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ambiguous_wild.builder.collect import natural_key
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.records import MotionResult
 from ambiguous_wild.builder.registration import INLIER_RATIO
 from ambiguous_wild.builder.relative_poses import MIN_INLIERS
+from ambiguous_wild.builder.residual_flow import flow_votes
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ModelCamera
-from ambiguous_wild.io.motion_points import FILE, MotionPoints, write_motion_points
+from ambiguous_wild.io.images import read_gray
+from ambiguous_wild.io.motion_points import FILE, NO_POINTS, MotionPoints, write_motion_points
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
 CLEARLY = 2.0  # a match moves if its epipolar error is this many times the largest of an inlier
@@ -181,9 +185,16 @@ def _group_features(features: np.ndarray, through: np.ndarray, reach: float) -> 
 
 
 def write_motion(
-    folder: Path, database: Path, relative_poses: Path, model: Path, flat: Path, train: Collection[str]
+    folder: Path,
+    database: Path,
+    relative_poses: Path,
+    model: Path,
+    flat: Path,
+    photos: Path,
+    train: Collection[str],
+    threads: int,
 ) -> MotionResult:
-    """Write the motion points of a scene into the folder of their stage.
+    """Write the motion points of a scene, and votes by optical flow in a sequence, into their stage's folder.
 
     Args:
         folder: folder of the stage.
@@ -191,7 +202,9 @@ def write_motion(
         relative_poses: file of the relative poses of pairs.
         model: folder of COLMAP's model, whose cameras have distortion.
         flat: folder of the model of the undistorted photos.
+        photos: folder of the undistorted photos, of any size.
         train: names of the train photos.
+        threads: photos at a time.
     """
     matched, colmap_model = Matched.read(database), pycolmap.Reconstruction(str(model))
     matched.take_cameras(colmap_model)
@@ -199,20 +212,23 @@ def write_motion(
     undistorted = read_model(flat)
     pinholes = {image.name: undistorted.cameras[image.camera_id] for image in undistorted.images.values()}
     # A model from another program has no points of these features.
-    photos = {
+    number_of = {
         number: k
         for k, number in enumerate(matched.ids)
         if matched.names[k] in train
         and number in colmap_model.images
         and colmap_model.images[number].num_points2D() == len(matched.features[k])
     }
-    through = seen_through(colmap_model, photos)
+    through = seen_through(colmap_model, number_of)
     points = motion_points(matched, matched.poses(colmap_model), train, pinholes, through)
+    names = sorted((n for n in train if n in pinholes), key=natural_key)
+    for name, flow in flow_votes(undistorted, lambda n: read_gray(photos / n), names, threads):
+        points[name] = dataclasses.replace(points.get(name, NO_POINTS), flow=flow)
     write_motion_points(folder / FILE, points)
     return {
         "static": sum(int((~p.moves).sum()) for p in points.values()),
         "moving": sum(int(p.moves.sum()) for p in points.values()),
-        "silent": sum(not len(p.xy) for p in points.values()),
+        "silent": sum(not p.informative for p in points.values()),
     }
 
 

@@ -154,14 +154,16 @@ class Stages:
         )
         motion = work.run(
             "motion",
-            [mapping.key, split.train],
+            [flat.key, split.train],
             lambda f: write_motion(
                 f,
                 matches.folder / DATABASE,
                 mapping.folder / RELATIVE_POSES,
                 mapping.folder / "0",
                 flat.folder / "sparse" / "0",
+                flat.folder / ("images" if factor == 1 else f"images_{factor}"),
                 split.train,
+                self.jobs,
             ),
         )
         drawn = work.run(

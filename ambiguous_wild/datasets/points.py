@@ -171,7 +171,16 @@ def find_motion(
     run_job(job, scratch, lambda: None)
     bar.finish()
     known = scratch / "known"
-    stats = write_motion(scene, database, scratch / RELATIVE_POSES, known, scene / "sparse" / "0", train)
+    stats = write_motion(
+        scene,
+        database,
+        scratch / RELATIVE_POSES,
+        known,
+        scene / "sparse" / "0",
+        scene / "images",
+        train,
+        jobs,
+    )
     if 2 * stats["silent"] > len(train):
         raise AwError(
             f"in {stats['silent']} of {len(train)} train photos no matches fit the given poses, so it is "

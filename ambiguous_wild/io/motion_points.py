@@ -1,4 +1,7 @@
-"""motion.npz of a scene: features that are static by other train photos, and features that move."""
+"""motion.npz of a scene: features that are static by other train photos, and features that move.
+
+In a sequence it also has votes of neighbouring frames for every pixel, by `builder/residual_flow.py`.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from ambiguous_wild.io.files import atomic_path
 
 FILE = "motion.npz"  # in the scene's folder
 _COLUMNS = {"xy": ("f4", (2,)), "static": ("u1", ()), "moving": ("u1", ()), "motion": ("i2", ())}
-_MAX_BYTES = 1 << 28  # largest unpacked size; a thousand photos have about 2e7
+_MAX_BYTES = 1 << 28  # largest unpacked size; a thousand photos have about 2e7, of a sequence 6e7
 # Exceptions that numpy and zipfile raise for a damaged file, besides their own.
 _DAMAGE = (ValueError, LookupError, OSError, EOFError, TypeError, AttributeError, RuntimeError, MemoryError,
            OverflowError)  # fmt: skip
@@ -31,11 +34,22 @@ class MotionPoints:
     # [N] uint8, photos in which it fits only another rigid motion, or that see through it
     moving: np.ndarray
     motion: np.ndarray  # [N] int16, from 1: features of the photo that move together; 0 = does not move
+    # [2, h, w] uint8, neighbouring frames whose optical flow shows that a pixel stays, and that it moves;
+    # None: the photo is of no sequence
+    flow: np.ndarray | None = None
+
+    @property
+    def informative(self) -> bool:
+        """Whether any feature or pixel has a vote."""
+        return bool(len(self.xy)) or (self.flow is not None and bool(self.flow.any()))
 
     @property
     def moves(self) -> np.ndarray:
         """[N] bool: more photos call the feature moving than static."""
         return self.moving > self.static
+
+
+NO_POINTS = MotionPoints(*(np.zeros((0, *shape), dtype) for dtype, shape in _COLUMNS.values()))
 
 
 def write_motion_points(path: Path, photos: Mapping[str, MotionPoints]) -> None:
@@ -46,6 +60,10 @@ def write_motion_points(path: Path, photos: Mapping[str, MotionPoints]) -> None:
         for name, (dtype, shape) in _COLUMNS.items()
     }
     names, counts = np.array(list(photos), dtype=np.str_), np.array([len(p.xy) for p in points], np.int64)
+    if any(p.flow is not None for p in points):
+        flows = [np.zeros((2, 0, 0), np.uint8) if p.flow is None else p.flow for p in points]
+        columns["flow_shapes"] = np.array([flow.shape[1:] for flow in flows], np.int64)
+        columns["flow"] = np.concatenate([flow.ravel() for flow in flows])
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, names=names, counts=counts, **columns)
 
@@ -81,4 +99,15 @@ def _read(file: Mapping[str, np.ndarray]) -> dict[str, MotionPoints]:
     if not fit or not ((columns[0] >= 0) & (columns[0] <= 1)).all():
         raise ValueError("its arrays do not fit together")
     parts = zip(*(np.split(column, np.cumsum(counts)[:-1]) for column in columns))
-    return {name: MotionPoints(*part) for name, part in zip(names.tolist(), parts)}
+    flows = _read_flows(file, len(names)) if "flow" in file else [None] * len(names)
+    return {name: MotionPoints(*part, flow=flow) for name, part, flow in zip(names.tolist(), parts, flows)}
+
+
+def _read_flows(file: Mapping[str, np.ndarray], count: int) -> list[np.ndarray | None]:
+    """Read the votes [2, h, w] of each photo; None where it has none."""
+    shapes, flow = file["flow_shapes"], file["flow"]
+    fit = shapes.dtype == np.int64 and shapes.shape == (count, 2) and shapes.min(initial=0) >= 0
+    if not fit or flow.dtype != np.uint8 or flow.shape != (2 * int(shapes.prod(axis=1).sum()),):
+        raise ValueError("its arrays do not fit together")
+    parts = np.split(flow, np.cumsum(2 * shapes.prod(axis=1))[:-1])
+    return [p.reshape(2, *shape) if p.size else None for p, shape in zip(parts, shapes.tolist())]

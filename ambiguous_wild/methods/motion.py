@@ -55,7 +55,7 @@ class MotionMask(FixedMasks):
         self.data = data
         points = self.points = read_motion_points(data.scene.root)
         names = [view.name for view in data.scene.train]
-        with_points = [name for name in names if name in points and len(points[name].xy)]
+        with_points = [name for name in names if name in points and points[name].informative]
         if not with_points:
             raise AwError(
                 f"scene {data.scene.name} does not say what moves (motion.npz has none of its train photos): "

@@ -1,8 +1,9 @@
-"""Maps of what moves in a photo, from matches of its features with other photos.
+"""Maps of what moves in a photo, from matches of its features, and of its pixels, with other photos.
 
 Structure from motion keeps the matches that fit the motion of the cameras. Matches that fit another rigid
 motion lie on distractors, also on those that neither colour nor structure tells apart; the other matches lie
-everywhere else. Pixels between features are decided by the features near them and in their segment.
+everywhere else. Pixels between features are decided by the features near them and in their segment. In a
+sequence optical flow votes on each pixel, too.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from ambiguous_wild.vision.sam import SamInstances
 from ambiguous_wild.vision.sparse_surface import PIXELS
 
 MOVES = 0.6  # a pixel moves if `moving_map` is above this
+CERTAIN = 0.8  # and certainly by optical flow, if above this
 POINTS = "features: green stay, red move"  # caption of `draw_points`
 # Reach of a feature: standard deviation in px on a map of `PIXELS`. Static features reach less far, because
 # what hides them may move.
@@ -52,8 +54,13 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
         np.add.at(at_feature, (row, column), weight)
         near.append(cv2.GaussianBlur(at_feature, (0, 0), reach) * np.float32(2.0 * math.pi * reach**2))
         total = np.bincount(segments[row, column], weight, minlength=int(segments.max()) + 1)
-        total[0] = 0.0
-        of_segment.append(total.astype(np.float32))
+        of_segment.append(total)
+    if points.flow is not None:
+        flow = points.flow.astype(np.float32)
+        for kind, votes in enumerate(cv2.resize(m, (w, h), interpolation=cv2.INTER_AREA) for m in flow[::-1]):
+            near[kind] += votes
+            of_segment[kind] += np.bincount(segments.ravel(), votes.ravel(), minlength=len(of_segment[kind]))
+    of_segment = [np.r_[0.0, total[1:]].astype(np.float32) for total in of_segment]
     # Only what moves spreads in its segment: a distractor of the background's colour shares the background's.
     # Large segments hold both kinds, so their vote is small and decides only far from features.
     excess = np.maximum(of_segment[0] - of_segment[1], 0.0) / np.maximum(of_segment[0] + of_segment[1], 1.0)

@@ -98,6 +98,9 @@ def reasons(store: MaskStore, view: int, maps: Maps, masks: PhotoMasks) -> MaskR
     else:
         add(masked & masks.global_, "masked: it stands out from the rest of the photo")
     add(masked & (judged > threshold), f"masked: {differs} ({value})")
+    moving = store.moving[view]
+    if moving is not None:
+        add(masked & moving, "masked: it moves between neighbouring frames")
     static, seen = store.labels.static.get(view), store.pixels.seen[view]
     if static is not None:
         add(static & ~masked, "kept: structure from motion shows that its region does not move")

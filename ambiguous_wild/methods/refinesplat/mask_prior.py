@@ -31,6 +31,7 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.io.images import ximgproc
 from ambiguous_wild.methods.refinesplat.maps import Ranks, common_offset
 from ambiguous_wild.methods.refinesplat.multiview import nearest_views
+from ambiguous_wild.vision.motion_maps import CERTAIN
 from ambiguous_wild.vision.sparse_surface import BEHIND, PIXELS, in_map, world_points
 
 _SETTLED = 0.005  # a round in which a smaller share of pixels changes is the last
@@ -93,6 +94,7 @@ class InitialMaskPrior:
     most: float = 1.0  # largest share of the photo that later masks cover
     # in a crowd later masks lie within those of the first look: the ground between people shows in few photos
     within: bool = False
+    moves: np.ndarray | None = None  # bool, masked whatever later evidence says; None: nothing is
 
     def keep(self, shape: tuple[int, int]) -> np.ndarray | None:
         """Return the pixels that are kept at first, [H, W] bool; None if all are."""
@@ -100,6 +102,12 @@ class InitialMaskPrior:
         if passing.mean() < self.least:
             return None
         return _resized(passing.astype(np.float32), shape) < 0.5
+
+    def moving(self, shape: tuple[int, int]) -> np.ndarray | None:
+        """Return the pixels that move for certain, [H, W] bool; None if unknown or none do."""
+        if self.moves is None or not self.moves.any():
+            return None
+        return _resized(self.moves.astype(np.float32), shape) > 0.5
 
     def factor(self, shape: tuple[int, int]) -> np.ndarray:
         """Return the factor of the evidence of later masks, [H, W] float32 in [1 / weight, weight]."""
@@ -112,6 +120,8 @@ def initial_mask_prior(
     surfaces: Sequence[np.ndarray | None],
     config: FirstLookConfig,
     moving: Sequence[np.ndarray | None] | None = None,
+    *,
+    by_flow: bool = False,
 ) -> list[InitialMaskPrior | None]:
     """Return the first look at every photo; None for one without sparse points or comparable views.
 
@@ -121,6 +131,7 @@ def initial_mask_prior(
         surfaces: inverse depths [h, w] of the sparse points (`static_surfaces`).
         config: thresholds.
         moving: what moves in each photo (`moving_map`), in the shape of its surface; None: unknown.
+        by_flow: whether optical flow tells that for every pixel, not features alone.
     """
     small = [
         None if inverse is None else _small(photo, inverse.shape)
@@ -161,20 +172,25 @@ def initial_mask_prior(
     answers = [answer(view, config.views, nothing, moves) for view in everything]
     views = config.views
     if masked_share(answers) >= config.crowd:
-        # features of a crowd are too few: renders get worse by 0.3 to 0.8 dB
-        moves, views = nothing, 2 * views
-        answers = [answer(view, config.views, nothing, nothing) for view in everything]
+        views = 2 * views
+        if not by_flow:
+            # features of a crowd are too few: renders get worse by 0.3 to 0.8 dB
+            moves = nothing
+            answers = [answer(view, config.views, nothing, nothing) for view in everything]
     for _ in range(config.rounds):
         before, answers = answers, [answer(view, views, answers, answers) for view in everything]
         if _changed(before, answers) < _SETTLED:
             break
     crowd = masked_share(answers) >= config.crowd
     weight = config.crowd_weight if crowd else config.weight
+    certain = [None if m is None or not by_flow else m > CERTAIN for m in moves]
     return [
         None
         if passing is None
-        else InitialMaskPrior(passing, config.least, weight, _most(passing, inverse, config), crowd)
-        for passing, inverse in zip(answers, surfaces, strict=True)
+        else InitialMaskPrior(
+            passing, config.least, weight, _most(passing, inverse, config), crowd, moves_for_certain
+        )
+        for passing, inverse, moves_for_certain in zip(answers, surfaces, certain, strict=True)
     ]
 
 

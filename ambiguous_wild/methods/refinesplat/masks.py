@@ -149,6 +149,7 @@ def make_masks(
     config: MaskConfig,
     ceiling: Tensor | None = None,
     maskable: Tensor | None = None,
+    moving: Tensor | None = None,
 ) -> PhotoMasks:
     """Make M_local, M_global and the keep map of one photo (Eqs. 3-7).
 
@@ -162,6 +163,7 @@ def make_masks(
         config: thresholds.
         ceiling: upper limit of the threshold, 0-d; None: no limit.
         maskable: pixels that may be masked, [H, W] bool; None: all.
+        moving: pixels that move for certain, [H, W] bool; None: none do.
     """
     height, width = shape = labels.shapes[view]
     pixels = enlarge(maps.statistic, height, width)
@@ -207,6 +209,8 @@ def make_masks(
     final = grown(final, config, judging)
     if maskable is not None:
         final = final & maskable
+    if moving is not None:
+        final = final | moving
     return PhotoMasks(local, global_, (~final).float(), means, distances, cut, pool)
 
 
@@ -247,10 +251,16 @@ class MaskStore:
             keep = None if look is None or not look.within else look.keep(sizes[view])
             return None if keep is None else ~keep
 
+        def moving(view: int) -> np.ndarray | None:
+            look = looks.get(view)
+            return None if look is None else look.moving(sizes[view])
+
         # factor of the evidence of each view, [H, W]; None if it is 1
         self.factors = EnlargedMaps(factor, len(photos), device)
         # pixels of each view that may be masked, [H, W] bool; None if all may
         self.maskable = EnlargedMaps(maskable, len(photos), device)
+        # pixels of each view that move for certain, [H, W] bool; None if none do
+        self.moving = EnlargedMaps(moving, len(photos), device)
         self.limited = {view: config.mask.limited(look.most) for view, look in looks.items()}
         self.keeps: dict[int, Tensor] = {}  # view -> its keep map [H, W] uint8, if it has one
         wide, views = torch.float64, len(photos)
@@ -316,7 +326,9 @@ class MaskStore:
             maskable = crowd if maskable is None else maskable & crowd
         w2 = torch.sigmoid(self.theta) if mask.w2 is None else mask.w2
         others = self.means, self.distances
-        return maps, make_masks(view, maps, self.labels, others, w2, mask, ceiling, maskable)
+        return maps, make_masks(
+            view, maps, self.labels, others, w2, mask, ceiling, maskable, self.moving[view]
+        )
 
     @property
     def w2(self) -> float:

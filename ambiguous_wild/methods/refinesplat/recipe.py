@@ -139,7 +139,10 @@ class RefineSplatMask(PausingMask):
         if config.first_look.on:
             moving = self._moving(surfaces) if config.first_look.motion > 0 else None
             photos = (photo.cpu().numpy() for photo in data.photos)  # one at a time: all may not fit
-            looks = initial_mask_prior(data.cameras, photos, surfaces, config.first_look, moving)
+            by_flow = any(points.flow is not None for points in self.points.values())
+            looks = initial_mask_prior(
+                data.cameras, photos, surfaces, config.first_look, moving, by_flow=by_flow
+            )
             self.looks = {view: look for view, look in enumerate(looks) if look is not None}
         labels, static = self.inputs.labels, self.inputs.static
         self.masks = MaskStore(config, data, surfaces, self.looks, labels, static, self.compare)

@@ -1,0 +1,214 @@
+"""What moves between neighbouring frames of a sequence: optical flow less the rigid flow of the static scene.
+
+Smooth cloth has no features, and cloth of the wall's colour differs from no render. Optical flow sees both
+where frames follow each other closely. The matches of a static pixel lie on its epipolar lines, at one depth,
+and not behind the surface that surrounds it. So one depth is fitted to all matches of a pixel; what is left
+is its residual flow, also for motion along the epipolar line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from ambiguous_wild.core.machine import in_order
+from ambiguous_wild.io.colmap_records import ColmapModel
+
+SIDE = 480  # px, longer side of the frames that flow is computed on
+MAP_PIXELS = 20_000  # of a map of votes
+REACH = 2  # frames before and after
+FEWEST_FRAMES = 6  # a sequence has at least this many
+PROBES = 8  # pairs that decide whether photos are a sequence
+FLOWS = 0.5  # share of a pair's pixels whose flow must return
+RETURNS_PX, RETURNS_SHARE = 1.0, 0.05  # largest distance after there and back: px, and share of the flow
+LEAST_PX = 0.35  # least uncertainty of a match
+MOVES, STAYS = 4.0, 2.0  # residual in units of its uncertainty, from which or up to which a frame votes
+FITS = 4  # of the depth, each with weights from the residuals of the last
+# A pixel is behind the static surface if points surround it within this share of the longer side, and its
+# inverse depth is less than this share of the least of theirs; it stays only if not above the greatest.
+AROUND, BEHIND, IN_FRONT = 0.12, 0.7, 1.3
+POINTS_FROM = 4  # frames before and after, whose points make that surface
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A photo of the sequence and its camera, undistorted."""
+
+    grey: np.ndarray  # [h, w] uint8
+    intrinsics: np.ndarray  # [3, 3], pixel centres are whole numbers
+    cam_from_world: np.ndarray  # [4, 4]
+
+    @property
+    def map_shape(self) -> tuple[int, int]:
+        """Shape of its map of votes."""
+        scale = min(1.0, (MAP_PIXELS / self.grey.size) ** 0.5)
+        return max(round(self.grey.shape[0] * scale), 1), max(round(self.grey.shape[1] * scale), 1)
+
+    def map_positions(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return x and y in px of the centres of the map's pixels, [h, w] float32 each."""
+        (h, w), (rows, columns) = self.map_shape, self.grey.shape
+        x, y = (np.arange(w) + 0.5) * (columns / w) - 0.5, (np.arange(h) + 0.5) * (rows / h) - 0.5
+        return np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matches of one frame's map in another frame."""
+
+    xy: np.ndarray  # [h, w, 2] float32, px of the other frame
+    return_px: np.ndarray  # [h, w] float32, distance after there and back
+    returns: np.ndarray  # [h, w] bool
+
+
+def flow_votes(
+    model: ColmapModel, read: Callable[[str], np.ndarray], names: Sequence[str], threads: int
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Count for each pixel the neighbouring frames that show that it stays or moves.
+
+    Args:
+        model: of the undistorted photos, with points.
+        read: returns a photo by its name, [H, W] uint8.
+        names: photos in the order in which they were taken.
+        threads: pairs at a time.
+
+    Yields:
+        Name and [2, h, w] uint8: frames in which a pixel stays, frames in which it moves. Nothing if the
+        photos are no sequence.
+    """
+    images = {image.name: image for image in model.images.values()}
+
+    @lru_cache(maxsize=REACH + 2 + 2 * threads)
+    def frame(k: int) -> Frame:
+        image = images[names[k]]
+        grey = read(names[k])
+        scale = min(1.0, SIDE / max(grey.shape))
+        size = max(round(grey.shape[1] * scale), 1), max(round(grey.shape[0] * scale), 1)
+        camera = model.cameras[image.camera_id]
+        fx, fy, cx, cy = camera.pinhole()
+        sx, sy = size[0] / camera.width, size[1] / camera.height
+        intrinsics = np.array([[fx * sx, 0, cx * sx - 0.5], [0, fy * sy, cy * sy - 0.5], [0, 0, 1.0]])
+        return Frame(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), intrinsics, image.cam_from_world())
+
+    def pair(ab: tuple[int, int]) -> tuple[Matches, Matches]:
+        return _matches(frame(ab[0]), frame(ab[1]))
+
+    count = len(names)
+    if count < FEWEST_FRAMES:
+        return
+    probed = np.unique(np.linspace(0, count - 2, PROBES).astype(int)).tolist()
+    returning = [
+        float(there.returns.mean()) for there, _ in in_order(pair, [(k, k + 1) for k in probed], threads)
+    ]
+    if np.median(returning) < FLOWS:
+        return
+    known: dict[int, dict[int, Matches]] = {k: {} for k in range(count)}
+    pairs = [(a, b) for b in range(count) for a in range(max(b - REACH, 0), b)]
+    found = in_order(pair, pairs, threads)
+    for latest in range(count + REACH):
+        for earlier in range(max(latest - REACH, 0), latest if latest < count else 0):
+            known[earlier][latest], known[latest][earlier] = next(found)
+        if (complete := latest - REACH) >= 0:
+            near = range(max(complete - POINTS_FROM, 0), min(complete + POINTS_FROM + 1, count))
+            ids = np.unique(np.concatenate([images[names[n]].point_ids for n in near]))
+            xyz = model.points.xyz[np.searchsorted(model.points.ids, ids[ids >= 0])]
+            others = [(frame(n), m) for n, m in known.pop(complete).items() if m.returns.mean() >= FLOWS]
+            yield names[complete], count_votes(frame(complete), others, xyz)
+
+
+def _flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)
+
+
+def _matches(first: Frame, second: Frame) -> tuple[Matches, Matches]:
+    """Return the matches of the first frame's map in the second, and of the second's in the first."""
+    there, back = _flow(first.grey, second.grey), _flow(second.grey, first.grey)
+    return _matched(first, there, back), _matched(second, back, there)
+
+
+def _matched(frame: Frame, there: np.ndarray, back: np.ndarray) -> Matches:
+    x, y = frame.map_positions()
+    flow = cv2.remap(there, x, y, cv2.INTER_LINEAR)
+    xy = np.dstack([x, y]) + flow
+    returned = cv2.remap(
+        back, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e4, 1e4)
+    )
+    away = np.linalg.norm(flow + returned, axis=2)
+    return Matches(xy, away, away <= RETURNS_PX + RETURNS_SHARE * np.linalg.norm(flow, axis=2))
+
+
+def count_votes(frame: Frame, others: Sequence[tuple[Frame, Matches]], xyz: np.ndarray) -> np.ndarray:
+    """Return the numbers of frames in which each pixel stays or moves, [2, h, w] uint8.
+
+    Args:
+        frame: the frame of the map.
+        others: neighbours, with the map's matches in them.
+        xyz: [M, 3] points of the static scene that are visible around the frame.
+    """
+    votes = np.zeros((2, *frame.map_shape), np.uint8)
+    if not others:
+        return votes
+    x, y = frame.map_positions()
+    rays = np.dstack([x, y, np.ones_like(x)]) @ np.linalg.inv(frame.intrinsics).T
+    least, greatest = surrounding_inverse_depths(frame, xyz)
+    # a static pixel of inverse depth r is at the projection of `away` + r * `shift` in another frame
+    away, shift = [], []
+    for other, _ in others:
+        relative = other.cam_from_world @ np.linalg.inv(frame.cam_from_world)
+        away.append(rays @ (other.intrinsics @ relative[:3, :3]).T)
+        shift.append(other.intrinsics @ relative[:3, 3])
+    unit = [np.maximum(LEAST_PX, m.return_px) for _, m in others]
+    inverse, residuals = np.zeros(x.shape), [np.zeros(x.shape)] * len(others)
+    for _ in range(FITS):
+        above, below = np.zeros(x.shape), np.full(x.shape, 1e-12)
+        for (_, m), a, b, u, r in zip(others, away, shift, unit, residuals):
+            weight = m.returns / (u * (1.0 + (r / STAYS) ** 2) * (a[..., 2] + inverse * b[2])) ** 2
+            for axis in range(2):
+                slope = m.xy[..., axis] * b[2] - b[axis]
+                above += weight * slope * (a[..., axis] - m.xy[..., axis] * a[..., 2])
+                below += weight * slope**2
+        inverse = np.maximum(above / below, BEHIND * least)
+        residuals = []
+        for (_, m), a, b, u in zip(others, away, shift, unit):
+            projected = a + inverse[..., None] * b
+            depth = np.maximum(projected[..., 2:], 1e-6)
+            distance = np.linalg.norm(projected[..., :2] / depth - m.xy, axis=2)
+            # errors of poses and of flow are alike everywhere in a pair
+            typical = 1.48 * float(np.median(distance[m.returns]))
+            residuals.append(distance / np.maximum(u, typical))
+    near = (inverse <= IN_FRONT * greatest) & (least > 0)
+    for (_, m), r in zip(others, residuals):
+        votes[0] += m.returns & (r <= STAYS) & near
+        votes[1] += m.returns & (r >= MOVES)
+    return votes
+
+
+def surrounding_inverse_depths(frame: Frame, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the greatest inverse depth of the points around each pixel of a frame's map.
+
+    Returns:
+        [h, w] float64 each; 0 where points surround the pixel on fewer than four sides.
+    """
+    h, w = frame.map_shape
+    local = xyz @ frame.cam_from_world[:3, :3].T + frame.cam_from_world[:3, 3]
+    local = local[local[:, 2] > 1e-6]
+    x, y = (local @ frame.intrinsics.T)[:, :2].T / local[:, 2]
+    columns = np.floor((x + 0.5) * (w / frame.grey.shape[1])).astype(np.int64)
+    rows = np.floor((y + 0.5) * (h / frame.grey.shape[0])).astype(np.int64)
+    inside = (columns >= 0) & (columns < w) & (rows >= 0) & (rows < h)
+    least, greatest = np.full((h, w), np.inf), np.zeros((h, w))
+    at = rows[inside], columns[inside]
+    np.minimum.at(least, at, 1.0 / local[inside, 2])
+    np.maximum.at(greatest, at, 1.0 / local[inside, 2])
+    reach = max(round(AROUND * max(h, w)), 1)
+    window, surrounded = np.ones((reach, reach), np.uint8), np.ones((h, w), bool)
+    low, high = np.full((h, w), np.inf), np.zeros((h, w))
+    for anchor in ((0, 0), (0, reach - 1), (reach - 1, 0), (reach - 1, reach - 1)):
+        lows = cv2.erode(least, window, anchor=anchor, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf)
+        highs = cv2.dilate(greatest, window, anchor=anchor, borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
+        surrounded &= np.isfinite(lows)
+        low, high = np.minimum(low, lows), np.maximum(high, highs)
+    return np.where(surrounded, low, 0.0), np.where(surrounded, high, 0.0)

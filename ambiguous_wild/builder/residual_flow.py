@@ -26,6 +26,7 @@ PROBES = 8  # pairs that decide whether photos are a sequence
 FLOWS = 0.5  # share of a pair's pixels whose flow must return
 RETURNS_PX, RETURNS_SHARE = 1.0, 0.05  # largest distance after there and back: px, and share of the flow
 LEAST_PX = 0.35  # least uncertainty of a match
+MOST_PX = 3.0  # typical residual above which the poses of a pair do not fit, and it has no votes
 MOVES, STAYS = 4.0, 2.0  # residual in units of its uncertainty, from which or up to which a frame votes
 FITS = 4  # of the depth, each with weights from the residuals of the last
 # A pixel is behind the static surface if points surround it within this share of the longer side, and its
@@ -35,7 +36,7 @@ POINTS_FROM = 4  # frames before and after, whose points make that surface
 
 
 @dataclass(frozen=True)
-class Frame:
+class SequenceFrame:
     """A photo of the sequence and its camera, undistorted."""
 
     grey: np.ndarray  # [h, w] uint8
@@ -82,7 +83,7 @@ def flow_votes(
     images = {image.name: image for image in model.images.values()}
 
     @lru_cache(maxsize=REACH + 2 + 2 * threads)
-    def frame(k: int) -> Frame:
+    def frame(k: int) -> SequenceFrame:
         image = images[names[k]]
         grey = read(names[k])
         scale = min(1.0, SIDE / max(grey.shape))
@@ -91,7 +92,9 @@ def flow_votes(
         fx, fy, cx, cy = camera.pinhole()
         sx, sy = size[0] / camera.width, size[1] / camera.height
         intrinsics = np.array([[fx * sx, 0, cx * sx - 0.5], [0, fy * sy, cy * sy - 0.5], [0, 0, 1.0]])
-        return Frame(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), intrinsics, image.cam_from_world())
+        return SequenceFrame(
+            cv2.resize(grey, size, interpolation=cv2.INTER_AREA), intrinsics, image.cam_from_world()
+        )
 
     def pair(ab: tuple[int, int]) -> tuple[Matches, Matches]:
         return _matches(frame(ab[0]), frame(ab[1]))
@@ -120,16 +123,17 @@ def flow_votes(
 
 
 def _flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return flow.calc(first, second, None)  # type: ignore[call-overload]
 
 
-def _matches(first: Frame, second: Frame) -> tuple[Matches, Matches]:
+def _matches(first: SequenceFrame, second: SequenceFrame) -> tuple[Matches, Matches]:
     """Return the matches of the first frame's map in the second, and of the second's in the first."""
     there, back = _flow(first.grey, second.grey), _flow(second.grey, first.grey)
     return _matched(first, there, back), _matched(second, back, there)
 
 
-def _matched(frame: Frame, there: np.ndarray, back: np.ndarray) -> Matches:
+def _matched(frame: SequenceFrame, there: np.ndarray, back: np.ndarray) -> Matches:
     x, y = frame.map_positions()
     flow = cv2.remap(there, x, y, cv2.INTER_LINEAR)
     xy = np.dstack([x, y]) + flow
@@ -140,7 +144,9 @@ def _matched(frame: Frame, there: np.ndarray, back: np.ndarray) -> Matches:
     return Matches(xy, away, away <= RETURNS_PX + RETURNS_SHARE * np.linalg.norm(flow, axis=2))
 
 
-def count_votes(frame: Frame, others: Sequence[tuple[Frame, Matches]], xyz: np.ndarray) -> np.ndarray:
+def count_votes(
+    frame: SequenceFrame, others: Sequence[tuple[SequenceFrame, Matches]], xyz: np.ndarray
+) -> np.ndarray:
     """Return the numbers of frames in which each pixel stays or moves, [2, h, w] uint8.
 
     Args:
@@ -162,6 +168,7 @@ def count_votes(frame: Frame, others: Sequence[tuple[Frame, Matches]], xyz: np.n
         shift.append(other.intrinsics @ relative[:3, 3])
     unit = [np.maximum(LEAST_PX, m.return_px) for _, m in others]
     inverse, residuals = np.zeros(x.shape), [np.zeros(x.shape)] * len(others)
+    nothing = np.full(x.shape, np.inf)
     for _ in range(FITS):
         above, below = np.zeros(x.shape), np.full(x.shape, 1e-12)
         for (_, m), a, b, u, r in zip(others, away, shift, unit, residuals):
@@ -178,15 +185,16 @@ def count_votes(frame: Frame, others: Sequence[tuple[Frame, Matches]], xyz: np.n
             distance = np.linalg.norm(projected[..., :2] / depth - m.xy, axis=2)
             # errors of poses and of flow are alike everywhere in a pair
             typical = 1.48 * float(np.median(distance[m.returns]))
-            residuals.append(distance / np.maximum(u, typical))
-    near = (inverse <= IN_FRONT * greatest) & (least > 0)
+            residuals.append(distance / np.maximum(u, typical) if typical <= MOST_PX else nothing)
+    # an imported model may have no points, and then nothing is known of depths
+    near = (inverse <= IN_FRONT * greatest) & (least > 0) if len(xyz) else np.ones(x.shape, bool)
     for (_, m), r in zip(others, residuals):
         votes[0] += m.returns & (r <= STAYS) & near
-        votes[1] += m.returns & (r >= MOVES)
+        votes[1] += m.returns & (r >= MOVES) & (r < np.inf)
     return votes
 
 
-def surrounding_inverse_depths(frame: Frame, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def surrounding_inverse_depths(frame: SequenceFrame, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the least and the greatest inverse depth of the points around each pixel of a frame's map.
 
     Returns:

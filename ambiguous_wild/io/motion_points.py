@@ -98,9 +98,9 @@ def _read(file: Mapping[str, np.ndarray]) -> dict[str, MotionPoints]:
         fit = fit and column.dtype == np.dtype(dtype) and column.shape == (total, *shape)
     if not fit or not ((columns[0] >= 0) & (columns[0] <= 1)).all():
         raise ValueError("its arrays do not fit together")
-    parts = zip(*(np.split(column, np.cumsum(counts)[:-1]) for column in columns))
+    parts = [np.split(column, np.cumsum(counts)[:-1]) for column in columns]
     flows = _read_flows(file, len(names)) if "flow" in file else [None] * len(names)
-    return {name: MotionPoints(*part, flow=flow) for name, part, flow in zip(names.tolist(), parts, flows)}
+    return {name: MotionPoints(*part) for name, *part in zip(names.tolist(), *parts, flows)}
 
 
 def _read_flows(file: Mapping[str, np.ndarray], count: int) -> list[np.ndarray | None]:

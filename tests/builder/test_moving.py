@@ -170,7 +170,7 @@ def test_what_moves_is_a_prompt(tmp_path):
             return mask
 
     points = two_points()
-    points = MotionPoints(*(np.concatenate([x[:1], x[:1], x]) for x in vars(points).values()))
+    points = MotionPoints(*(np.concatenate([x[:1], x[:1], x]) for x in list(vars(points).values())[:4]))
     labels = moving_labels(Disc(), torch.zeros(100, 120, 3), np.ones((100, 120), np.int32), points, tmp_path)
     assert (labels[:40, :50] == 2).all() and (labels[40:] == 1).all()
     assert moving_map(points, labels, (100, 120))[38, 48] > 0.6  # far from the feature, in its segment

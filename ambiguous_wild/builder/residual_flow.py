@@ -25,6 +25,8 @@ FEWEST_FRAMES = 6  # a sequence has at least this many
 PROBES = 8  # pairs that decide whether photos are a sequence
 FLOWS = 0.5  # share of a pair's pixels whose flow must return
 RETURNS_PX, RETURNS_SHARE = 1.0, 0.05  # largest distance after there and back: px, and share of the flow
+FAR_PX = 20.0  # median flow of the camera's rotation from which flow starts there, too
+COMPARED = 5  # px of a map, side of the window in which two matches are compared
 LEAST_PX = 0.35  # least uncertainty of a match
 MOST_PX = 3.0  # typical residual above which the poses of a pair do not fit, and it has no votes
 MOVES, STAYS = 4.0, 2.0  # residual in units of its uncertainty, from which or up to which a frame votes
@@ -55,6 +57,15 @@ class SequenceFrame:
         x, y = (np.arange(w) + 0.5) * (columns / w) - 0.5, (np.arange(h) + 0.5) * (rows / h) - 0.5
         return np.meshgrid(x.astype(np.float32), y.astype(np.float32))
 
+    def rotation_flow(self, other: SequenceFrame) -> np.ndarray:
+        """Return the flow [H, W, 2] float32 that the rotation between two frames causes, of far points."""
+        turn = other.cam_from_world[:3, :3] @ self.cam_from_world[:3, :3].T
+        h, w = self.grey.shape
+        xy = np.dstack([*np.meshgrid(np.arange(w), np.arange(h)), np.ones((h, w))])
+        ahead = xy @ (other.intrinsics @ turn @ np.linalg.inv(self.intrinsics)).T
+        there = ahead[..., :2] / np.maximum(ahead[..., 2:], 1e-6)
+        return np.clip(there - xy[..., :2], -SIDE, SIDE).astype(np.float32)
+
 
 @dataclass(frozen=True)
 class Matches:
@@ -63,6 +74,7 @@ class Matches:
     xy: np.ndarray  # [h, w, 2] float32, px of the other frame
     return_px: np.ndarray  # [h, w] float32, distance after there and back
     returns: np.ndarray  # [h, w] bool
+    differs: np.ndarray  # [h, w] float32, mean absolute difference of grey around the pixel
 
 
 def flow_votes(
@@ -122,18 +134,33 @@ def flow_votes(
             yield names[complete], count_votes(frame(complete), others, xyz)
 
 
-def _flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return flow.calc(first, second, None)  # type: ignore[call-overload]
-
-
 def _matches(first: SequenceFrame, second: SequenceFrame) -> tuple[Matches, Matches]:
-    """Return the matches of the first frame's map in the second, and of the second's in the first."""
-    there, back = _flow(first.grey, second.grey), _flow(second.grey, first.grey)
-    return _matched(first, there, back), _matched(second, back, there)
+    """Return the matches of the first frame's map in the second, and of the second's in the first.
+
+    Flow reaches some 60 px. Where the camera's rotation moves the scene as far, flow from that start is a
+    second candidate: the first follows what moves with the camera, the second what is static.
+    """
+    there, back = _candidate(first, second, None, None)
+    turns = first.rotation_flow(second), second.rotation_flow(first)
+    if np.median(np.linalg.norm(turns[0], axis=2)) >= FAR_PX:
+        pairs = zip((there, back), _candidate(first, second, *turns))
+        there, back = (_better(*both) for both in pairs)
+    return there, back
 
 
-def _matched(frame: SequenceFrame, there: np.ndarray, back: np.ndarray) -> Matches:
+def _candidate(
+    first: SequenceFrame, second: SequenceFrame, start: np.ndarray | None, start_back: np.ndarray | None
+) -> tuple[Matches, Matches]:
+    there, back = _flow(first.grey, second.grey, start), _flow(second.grey, first.grey, start_back)
+    return _matched(first, second, there, back), _matched(second, first, back, there)
+
+
+def _flow(first: np.ndarray, second: np.ndarray, start: np.ndarray | None) -> np.ndarray:
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return flow.calc(first, second, start)  # type: ignore[call-overload]
+
+
+def _matched(frame: SequenceFrame, other: SequenceFrame, there: np.ndarray, back: np.ndarray) -> Matches:
     x, y = frame.map_positions()
     flow = cv2.remap(there, x, y, cv2.INTER_LINEAR)
     xy = np.dstack([x, y]) + flow
@@ -141,7 +168,19 @@ def _matched(frame: SequenceFrame, there: np.ndarray, back: np.ndarray) -> Match
         back, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e4, 1e4)
     )
     away = np.linalg.norm(flow + returned, axis=2)
-    return Matches(xy, away, away <= RETURNS_PX + RETURNS_SHARE * np.linalg.norm(flow, axis=2))
+    looks = cv2.remap(other.grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    differs = cv2.absdiff(looks, cv2.remap(frame.grey, x, y, cv2.INTER_LINEAR))
+    returns = away <= RETURNS_PX + RETURNS_SHARE * np.linalg.norm(flow, axis=2)
+    return Matches(xy, away, returns, cv2.blur(differs.astype(np.float32), (COMPARED, COMPARED)))
+
+
+def _better(one: Matches, two: Matches) -> Matches:
+    """Choose at each pixel the match that returns, of two the one that looks more alike."""
+    second = two.returns & (~one.returns | (two.differs < one.differs))
+    return Matches(
+        np.where(second[..., None], two.xy, one.xy),
+        *(np.where(second, getattr(two, n), getattr(one, n)) for n in ("return_px", "returns", "differs")),
+    )
 
 
 def count_votes(

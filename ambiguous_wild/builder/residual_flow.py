@@ -157,7 +157,7 @@ def _candidate(
 
 def _flow(first: np.ndarray, second: np.ndarray, start: np.ndarray | None) -> np.ndarray:
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return flow.calc(first, second, start)  # type: ignore[call-overload]
+    return flow.calc(first, second, start)  # type: ignore[arg-type]
 
 
 def _matched(frame: SequenceFrame, other: SequenceFrame, there: np.ndarray, back: np.ndarray) -> Matches:

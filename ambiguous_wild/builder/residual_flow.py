@@ -23,7 +23,10 @@ MAP_PIXELS = 20_000  # of a map of votes
 REACH = 2  # frames before and after
 FEWEST_FRAMES = 6  # a sequence has at least this many
 PROBES = 8  # pairs that decide whether photos are a sequence
-FLOWS = 0.5  # share of a pair's pixels whose flow must return
+# Least share of the matches inside the other frame that return: in the median of the probed pairs of a
+# sequence, and in a pair that votes. Simulated walks of single photos have 0.75, with another place for each
+# distractor, simulated and real videos 0.83 to 0.98.
+SEQUENCE, FLOWS = 0.8, 0.5
 RETURNS_PX, RETURNS_SHARE = 1.0, 0.05  # largest distance after there and back: px, and share of the flow
 FAR_PX = 20.0  # median flow of the camera's rotation from which flow starts there, too
 COMPARED = 5  # px of a map, side of the window in which two matches are compared
@@ -75,6 +78,12 @@ class Matches:
     return_px: np.ndarray  # [h, w] float32, distance after there and back
     returns: np.ndarray  # [h, w] bool
     differs: np.ndarray  # [h, w] float32, mean absolute difference of grey around the pixel
+    inside: np.ndarray  # [h, w] bool, whether it lies in the other frame
+
+    @property
+    def returned(self) -> float:
+        """Share of the matches inside the other frame that return."""
+        return float((self.returns & self.inside).sum() / max(self.inside.sum(), 1))
 
 
 def flow_votes(
@@ -92,33 +101,30 @@ def flow_votes(
         Name and [2, h, w] uint8: frames in which a pixel stays, frames in which it moves. Nothing if the
         photos are no sequence.
     """
-    images = {image.name: image for image in model.images.values()}
+    images, count = {image.name: image for image in model.images.values()}, len(names)
+    if count < FEWEST_FRAMES:
+        return
+    # flow needs frames of one size, and undistorted photos of several cameras differ by some pixels
+    first = model.cameras[images[names[0]].camera_id]
+    scale = min(1.0, SIDE / max(first.width, first.height))
+    size = max(round(first.width * scale), 1), max(round(first.height * scale), 1)
 
     @lru_cache(maxsize=REACH + 2 + 2 * threads)
     def frame(k: int) -> SequenceFrame:
         image = images[names[k]]
-        grey = read(names[k])
-        scale = min(1.0, SIDE / max(grey.shape))
-        size = max(round(grey.shape[1] * scale), 1), max(round(grey.shape[0] * scale), 1)
         camera = model.cameras[image.camera_id]
         fx, fy, cx, cy = camera.pinhole()
         sx, sy = size[0] / camera.width, size[1] / camera.height
         intrinsics = np.array([[fx * sx, 0, cx * sx - 0.5], [0, fy * sy, cy * sy - 0.5], [0, 0, 1.0]])
-        return SequenceFrame(
-            cv2.resize(grey, size, interpolation=cv2.INTER_AREA), intrinsics, image.cam_from_world()
-        )
+        grey = cv2.resize(read(names[k]), size, interpolation=cv2.INTER_AREA)
+        return SequenceFrame(grey, intrinsics, image.cam_from_world())
 
     def pair(ab: tuple[int, int]) -> tuple[Matches, Matches]:
         return _matches(frame(ab[0]), frame(ab[1]))
 
-    count = len(names)
-    if count < FEWEST_FRAMES:
-        return
     probed = np.unique(np.linspace(0, count - 2, PROBES).astype(int)).tolist()
-    returning = [
-        float(there.returns.mean()) for there, _ in in_order(pair, [(k, k + 1) for k in probed], threads)
-    ]
-    if np.median(returning) < FLOWS:
+    neighbours = in_order(pair, [(k, k + 1) for k in probed], threads)
+    if np.median([there.returned for there, _ in neighbours]) < SEQUENCE:
         return
     known: dict[int, dict[int, Matches]] = {k: {} for k in range(count)}
     pairs = [(a, b) for b in range(count) for a in range(max(b - REACH, 0), b)]
@@ -130,7 +136,7 @@ def flow_votes(
             near = range(max(complete - POINTS_FROM, 0), min(complete + POINTS_FROM + 1, count))
             ids = np.unique(np.concatenate([images[names[n]].point_ids for n in near]))
             xyz = model.points.xyz[np.searchsorted(model.points.ids, ids[ids >= 0])]
-            others = [(frame(n), m) for n, m in known.pop(complete).items() if m.returns.mean() >= FLOWS]
+            others = [(frame(n), m) for n, m in known.pop(complete).items() if m.returned >= FLOWS]
             yield names[complete], count_votes(frame(complete), others, xyz)
 
 
@@ -171,7 +177,9 @@ def _matched(frame: SequenceFrame, other: SequenceFrame, there: np.ndarray, back
     looks = cv2.remap(other.grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     differs = cv2.absdiff(looks, cv2.remap(frame.grey, x, y, cv2.INTER_LINEAR))
     returns = away <= RETURNS_PX + RETURNS_SHARE * np.linalg.norm(flow, axis=2)
-    return Matches(xy, away, returns, cv2.blur(differs.astype(np.float32), (COMPARED, COMPARED)))
+    differs = cv2.blur(differs.astype(np.float32), (COMPARED, COMPARED))
+    inside = np.all((xy >= -0.5) & (xy < np.array(other.grey.shape[::-1]) - 0.5), axis=2)
+    return Matches(xy, away, returns, differs, inside)
 
 
 def _better(one: Matches, two: Matches) -> Matches:
@@ -179,7 +187,10 @@ def _better(one: Matches, two: Matches) -> Matches:
     second = two.returns & (~one.returns | (two.differs < one.differs))
     return Matches(
         np.where(second[..., None], two.xy, one.xy),
-        *(np.where(second, getattr(two, n), getattr(one, n)) for n in ("return_px", "returns", "differs")),
+        *(
+            np.where(second, getattr(two, n), getattr(one, n))
+            for n in ("return_px", "returns", "differs", "inside")
+        ),
     )
 
 

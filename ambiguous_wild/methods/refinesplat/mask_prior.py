@@ -183,7 +183,7 @@ def initial_mask_prior(
             break
     crowd = masked_share(answers) >= config.crowd
     weight = config.crowd_weight if crowd else config.weight
-    certain = [None if m is None or not by_flow else m > CERTAIN for m in moves]
+    certain = [None if m is None or not by_flow else _without_specks(m > CERTAIN) for m in moves]
     return [
         None
         if passing is None
@@ -192,6 +192,10 @@ def initial_mask_prior(
         )
         for passing, inverse, moves_for_certain in zip(answers, surfaces, certain, strict=True)
     ]
+
+
+def _without_specks(moves: np.ndarray) -> np.ndarray:
+    return cv2.morphologyEx(moves.astype(np.uint8), cv2.MORPH_OPEN, _WINDOW) > 0
 
 
 def _most(answer: np.ndarray, inverse: np.ndarray | None, config: FirstLookConfig) -> float:

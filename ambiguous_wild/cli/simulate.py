@@ -144,7 +144,7 @@ def _range(share: Summary) -> str:
 def _outside(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> int:
     """Count the train photos whose share of distractors is clearly outside ``spec.occlusion``."""
     low, high = spec.occlusion
-    if not spec.distractors or all(d.path == "walk" for d in spec.distractors):
+    if not spec.distractors or all(d.path != "elsewhere" for d in spec.distractors):
         return 0  # the place of a walker is given, not chosen
     slack = 0.02 + 0.1 * (high - low)  # because layouts were chosen by a small preview
     return sum(not low - slack <= photo["occlusion"] <= high + slack for photo in photos.values())

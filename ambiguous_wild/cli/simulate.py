@@ -203,6 +203,11 @@ def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
     help="Darkness of the shadows: 0 none, 1 black. Scenes only.",
 )
 @click.option(
+    "--path",
+    is_flag=True,
+    help="Let distractors cross the picture from photo to photo, in the order of the names. Plain photos only.",
+)
+@click.option(
     "--fixed",
     type=click.Choice(["bonnet", "stamp"]),
     help="Fixed to the camera: the same in all photos, test photos too. Plain photos only.",

@@ -94,8 +94,8 @@ def plan_cameras(
     """Plan train cameras along an arc with varying distance and height, and test cameras within their range.
 
     Test viewpoints have other angles than the train photos, and distances and heights between those of train
-    photos. An outward walk goes around the hub and looks away from it, a walk along the arc looks where it goes.
-    Train cameras of a video have equal steps and hardly shake.
+    photos. An outward walk goes around the hub and looks away from it; a walk along the arc looks where it
+    goes. Train cameras of a video have equal steps and hardly shake.
 
     Raises:
         AwError: the walk leads into a wall.
@@ -292,7 +292,7 @@ def _write_photo(
         pixels: [H, W, 3] uint8.
         spec: spec of the capture.
         camera: the photo's camera, which gives the focal length.
-        number: the photo's number, which gives the time: one photo every four seconds; frames of a video have none.
+        number: the photo's number, which gives the time: one photo every four seconds; not of a video.
         drawn: the photo's effects, which give exposure, ISO and white balance.
     """
     from PIL import Image

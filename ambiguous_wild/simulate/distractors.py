@@ -25,7 +25,7 @@ _APART_M = 0.75
 _CLEARANCE_M = {"car": 1.2}  # distance from static objects; other distractors keep 0.3 m
 _PREVIEW_PX = 96
 _STRIDES_M = 0.35  # strides of a walker per metre
-# A followed person sways: angle to either side, and cycles per photo of the sway, the distance and the stride.
+# A followed person sways: angle to either side; cycles per photo of the sway, the distance and the stride.
 _SWAY_DEG, _SWAY, _NEARING, _STEPS = 7.0, 0.07, 0.045, 0.13
 
 

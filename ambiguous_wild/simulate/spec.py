@@ -94,7 +94,7 @@ class Designed:
 
 @dataclass(frozen=True)
 class Distractor:
-    """An object that has another place in every photo, walks through the capture, or is followed by the camera."""
+    """An object that has another place in every photo, walks through the capture, or is followed."""
 
     name: str
     kind: Kind
@@ -266,8 +266,8 @@ class CaptureSpec:
     samples: int = 4  # rays a pixel, a square number
     detail_px_per_m: float = 110.0  # resolution of the textures
     focal_35mm: float = 26.0  # mm, the equivalent that phones state (CIPA: same diagonal angle)
-    # around: look at the hub; outward: stand around it and look away; orbit and along: as a video, at constant
-    # speed, looking at the hub or along the arc
+    # around: look at the hub; outward: stand around it and look away; orbit and along: frames of a video, at
+    # constant speed, that look at the hub or along the arc
     walk: Literal["around", "outward", "orbit", "along"] = "around"
     arc_deg: float = 104.0  # arc around the hub that the cameras cover
     radius_m: tuple[float, float] = (4.2, 5.3)  # distance from the hub during the walk

@@ -64,6 +64,7 @@ _NEAREST_WALL_M = 0.1
 _AHEAD_M = 4.0  # distance to the point that an outward camera looks at
 _ALONG_DEG, _ALONG_M = 45.0, 1.25  # angle to the point of the arc that a camera along it looks at; its height
 _VIDEO_SHAKE = 0.05  # of a hand that films, relative to that of single photos
+_SHEET = "truth/sheet.jpg"  # written by the command line, of the finished capture
 _LENS_MM = 4.2  # focal length without zoom
 _ISO = 64
 _DATE = "2025:06:14 15:{:02d}:{:02d}"
@@ -425,7 +426,7 @@ def _earlier(out: Path, identity: str, overwrite: bool) -> CaptureTruth | None:
         return cast(CaptureTruth, facts)
     if overwrite:
         if files:
-            refuse_foreign_files(out, {record.relative_to(out).as_posix(), *files})
+            refuse_foreign_files(out, {record.relative_to(out).as_posix(), _SHEET, *files})
         return None
     why = "with files changed since" if same else "of other settings or another version"
     raise AwError(f"{out} holds a capture ({kind}) {why}; add --overwrite to replace it or choose another -o")

@@ -56,8 +56,8 @@ _MAX_PIECES = 3  # largest number of pieces in a photo
 _SPREAD = (0.5, 1.5)  # range of a photo's coverage, relative to the mean
 _MAX_COVER = 0.6  # largest mean coverage of photos with distractors
 _MIDDLE = (0.15, 0.85)  # range of a piece's middle, relative to the photo's sides
-_LANES = 2  # largest number of pieces that cross the picture at a time, with `path`
-_CROSSING = (12.0, 28.0)  # photos that a piece takes to cross the picture
+_CROSSING = (14.0, 28.0)  # photos that a group of pieces takes to cross the picture, with `path`
+_FASTER = (0.5, 0.9)  # range of the time of faster pieces of the group, relative to that of the slowest
 _GROWTH = (0.8, 1.25)  # factor on a piece's size where it enters and where it leaves
 _DRIFT = 0.1  # greatest way up or down while it crosses, relative to the photo's height
 
@@ -125,7 +125,9 @@ def composite_photos(
                 continue
             over, pieces = np.zeros((*clean.shape[:2], 4), np.float32), list[Facts]()
             if tracks:
-                over, pieces = _pasted(*_under_way(tracks, number, clean.shape), clean.shape)
+                now, middles, heights = _under_way(tracks, number, clean.shape)
+                over, pieces = _pasted([tracks[k].piece for k in now], middles, heights, clean.shape)
+                pieces = [{**piece, "track": k} for piece, k in zip(pieces, now, strict=True)]
             elif path in chosen:
                 rng = np.random.default_rng(seed)
                 cover = float(mean * rng.uniform(*_SPREAD))
@@ -307,7 +309,7 @@ def _pasted(
 
 @dataclass(frozen=True)
 class _Track:
-    """A piece that crosses the picture at constant speed, from beyond one side to beyond the other."""
+    """A piece that crosses the picture at constant speed: it enters at one side and leaves at the other."""
 
     piece: _Drawn
     start: float  # number of the photo that it enters after
@@ -324,7 +326,7 @@ def _tracks(
     config: CompositeConfig,
     rng: np.random.Generator,
 ) -> list[_Track]:
-    """Draw pieces that cross one after another in each lane, at the size that gives the configured coverage.
+    """Draw groups of pieces that cross one after another, at the size that gives the configured coverage.
 
     Args:
         shapes: cut-outs; none: rounded shapes.
@@ -336,59 +338,66 @@ def _tracks(
     Raises:
         AwError: even the largest pieces cover less.
     """
-    busy = 1 - (1 - config.presence) ** (1 / _LANES)  # share of the time that a lane has a piece
     size = _read(paths[train[0]])[0].shape
-    area = config.coverage / (_LANES * busy) * size[0] * size[1]
+    area = config.coverage / config.presence * size[0] * size[1]
     tracks: list[_Track] = []
-    for _ in range(_LANES):
-        start = -rng.uniform(*_CROSSING)
-        while start < len(paths):
-            photos = rng.uniform(*_CROSSING)
-            others = [paths[n] for n in train if not start < n < start + photos] or [paths[n] for n in train]
-            (piece,) = _draw(shapes, others, area, 1, config.patches, rng)
+    begin, lasts = 0.0, rng.uniform(*_CROSSING)  # of a group, in photos
+    begin -= lasts * rng.random()  # the first is under way, so that a short sequence shows distractors, too
+    while begin < len(paths):
+        others = [paths[n] for n in train if not begin < n < begin + lasts] or [paths[n] for n in train]
+        drawn = _draw(shapes, others, area, _MAX_PIECES, config.patches, rng)
+        for k, (piece, tall) in enumerate(zip(drawn, natural_heights([c for c, _, _ in drawn], rng))):
+            photos = lasts * (rng.uniform(*_FASTER) if k else 1.0)
             y = rng.uniform(*_MIDDLE)
             ends = (y, float(np.clip(y + rng.uniform(-_DRIFT, _DRIFT), *_MIDDLE)))
-            first, last = natural_heights([piece[0]], rng) * rng.uniform(*_GROWTH, 2)
-            leftwards = bool(rng.random() < 0.5)
+            first, last = tall * rng.uniform(*_GROWTH, 2)
+            start, leftwards = begin + (lasts - photos) * rng.random(), bool(rng.random() < 0.5)
             tracks.append(_Track(piece, start, photos, leftwards, ends, (first, last)))
-            start += photos / busy
+        begin += lasts / config.presence
+        lasts = rng.uniform(*_CROSSING)
     preview = _camera(size[1], size[0], PREVIEW_PX / max(size[:2]))
     small = [replace(t, piece=(t.piece[0].reduced(PREVIEW_PX), *t.piece[1:])) for t in tracks]
 
     def share(scale: float) -> float:
         shares = []
         for number in train:
-            drawn, middles, heights = _under_way(_scaled(small, scale), number, size)
-            placements = _placements(middles, size)
-            shares.append(covered([c for c, _, _ in drawn], heights, placements, preview) if drawn else 0.0)
+            now, middles, heights = _under_way(_scaled(small, scale, size), number, size)
+            shown, placements = [small[k].piece[0] for k in now], _placements(middles, size)
+            shares.append(covered(shown, heights, placements, preview))
         return float(np.mean(shares))
 
-    largest = longest_side(np.array([max(t.height) for t in tracks]), [t.piece[0] for t in tracks])
-    high = LONGEST * max(1.0, size[1] / size[0]) / largest
+    high = LONGEST * max(1.0, size[1] / size[0]) / min(min(t.height) for t in tracks)
     if share(high) < config.coverage:
         raise AwError(
             f"--coverage {config.coverage:g} is more than --path can cover ({share(high):.2f} with the "
             "largest pieces); lower it or raise --presence"
         )
-    return _scaled(tracks, bisected(share, high, config.coverage))
+    return _scaled(tracks, bisected(share, high, config.coverage), size)
 
 
-def _scaled(tracks: Sequence[_Track], scale: float) -> list[_Track]:
-    return [replace(t, height=(scale * t.height[0], scale * t.height[1])) for t in tracks]
+def _scaled(tracks: Sequence[_Track], scale: float, size: tuple[int, ...]) -> list[_Track]:
+    """Scale the pieces, none of them beyond the largest size."""
+    longest = LONGEST * max(1.0, size[1] / size[0])
+    limits = [longest / max(1.0, t.piece[0].aspect) for t in tracks]
+    return [
+        replace(t, height=(min(scale * t.height[0], limit), min(scale * t.height[1], limit)))
+        for t, limit in zip(tracks, limits, strict=True)
+    ]
 
 
 def _under_way(
     tracks: Sequence[_Track], number: int, size: tuple[int, ...]
-) -> tuple[list[_Drawn], np.ndarray, np.ndarray]:
-    """Return the pieces in the photo of this number, with middles [K, 2] over its sides and heights [K]."""
-    now = [(t, (number - t.start) / t.photos) for t in tracks if t.start < number < t.start + t.photos]
-    heights = np.array([np.interp(s, (0, 1), t.height) for t, s in now])
-    middles = np.zeros((len(now), 2))
-    for k, (track, s) in enumerate(now):
+) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Return indices [K] of the tracks in a photo, middles [K, 2] over its sides, and heights [K]."""
+    now = [k for k, t in enumerate(tracks) if t.start < number < t.start + t.photos]
+    middles, heights = np.zeros((len(now), 2)), np.zeros(len(now))
+    for k, track in enumerate(tracks[i] for i in now):
+        s = (number - track.start) / track.photos
+        heights[k] = np.interp(s, (0, 1), track.height)
         half = heights[k] * track.piece[0].aspect / 2 * size[0] / size[1]
         x = s * (1 + 2 * half) - half
         middles[k] = 1 - x if track.leftwards else x, np.interp(s, (0, 1), track.y)
-    return [t.piece for t, _ in now], middles, heights
+    return now, middles, heights
 
 
 def _camera(width: int, height: int, scale: float) -> Camera:

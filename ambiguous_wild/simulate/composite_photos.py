@@ -61,7 +61,6 @@ _FASTER = (0.5, 0.9)  # range of the time of faster pieces of the group, relativ
 _GROWTH = (0.8, 1.25)  # factor on a piece's size where it enters and where it leaves
 _DRIFT = 0.1  # greatest way up or down while it crosses, relative to the photo's height
 
-
 _Drawn = tuple[Cutout, str, bool]  # piece, photo that it was cut from (empty for cut-outs), mirrored or not
 
 
@@ -109,7 +108,7 @@ def composite_photos(
     if cutouts is None and not config.patches:
         chosen = set()
     tracks: list[_Track] = []
-    if config.path and (shapes or config.patches):
+    if config.path:
         numbers = [i for i, test in enumerate(is_test) if not test]
         tracks = _tracks(shapes, paths, numbers, config, np.random.default_rng(choice_seed))
     photos: dict[str, Facts] = {}

@@ -117,6 +117,8 @@ def check_request(root: Path, target: Path, config: CompositeConfig, cutouts: Pa
             "no distractors are given: pass --cutouts FOLDER of PNG files with alpha, --patches, or (plain "
             "photos) --fixed"
         )
+    if config.path and cutouts is None and not config.patches:
+        raise AwError("--path moves cut-outs, and none are given: pass --cutouts FOLDER or --patches")
 
 
 def _check_scene(scene: Scene) -> None:

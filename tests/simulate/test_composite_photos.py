@@ -183,6 +183,7 @@ def test_the_command_says_what_comes_next(photos: Path, tmp_path: Path) -> None:
     ("words", "expected"),
     [
         ([], "--cutouts FOLDER"),
+        (["--path", "--fixed", "stamp"], "--path moves cut-outs, and none are given"),
         (["--patches", "--pose", "lying"], "--pose needs the depths"),
         (["--patches", "--shadow", "0.5"], "--shadow needs the depths"),
         (["--patches", "--coverage", "0.5", "--presence", "0.3"], "raise --presence"),
@@ -252,3 +253,13 @@ def test_on_a_path_the_seed_decides_every_byte(photos: Path, tmp_path: Path) -> 
         composite_photos(photos, tmp_path / name, replace(CONFIG, path=True, presence=1.0, seed=seed))
     one, again, other = (hashes(tmp_path / name) for name in ("one", "again", "other"))
     assert one == again and one != other
+
+
+def test_on_a_path_strips_cannot_cover_much(photos: Path, tmp_path: Path) -> None:
+    rgba = np.zeros((12, 400, 4), np.uint8)
+    rgba[1:-1, 1:-1] = 255
+    (tmp_path / "cutouts").mkdir()
+    Image.fromarray(rgba).save(tmp_path / "cutouts/strip.png")
+    with pytest.raises(AwError, match=r"--coverage 0.4 is more than --path can cover \(0\.\d\d with"):
+        composite_photos(photos, tmp_path / "raw", CompositeConfig(0.4, path=True), tmp_path / "cutouts")
+    assert [p.name for p in tmp_path.iterdir()] == ["cutouts"]

@@ -47,7 +47,7 @@ def test_an_option_of_one_name_has_one_kind_of_value() -> None:
         for flag, option in options.items():
             kinds[flag][_kind(option)].add(command)
     differ = {flag: dict(found) for flag, found in kinds.items() if len(found) > 1}
-    # --overwrite: a flag, or never | missing | always, see below; --path: a flag, or the path of a film's camera
+    # --overwrite: a flag, or never | missing | always, see below; --path: a flag, or the path of a camera
     assert set(differ) == {"--overwrite", "--path"}, differ
 
 

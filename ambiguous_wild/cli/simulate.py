@@ -144,7 +144,7 @@ def _range(share: Summary) -> str:
 def _outside(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> int:
     """Count the train photos whose share of distractors is clearly outside ``spec.occlusion``."""
     low, high = spec.occlusion
-    if not spec.distractors or all(d.path == "walk" for d in spec.distractors):
+    if not spec.distractors or all(d.path != "elsewhere" for d in spec.distractors):
         return 0  # the place of a walker is given, not chosen
     slack = 0.02 + 0.1 * (high - low)  # because layouts were chosen by a small preview
     return sum(not low - slack <= photo["occlusion"] <= high + slack for photo in photos.values())
@@ -201,6 +201,11 @@ def _print_list(specs: Iterable[CaptureSpec], as_json: bool) -> None:
     default=0.0,
     show_default=True,
     help="Darkness of the shadows: 0 none, 1 black. Scenes only.",
+)
+@click.option(
+    "--path",
+    is_flag=True,
+    help="Let distractors cross the picture from photo to photo, in the order of the names. Plain photos only.",
 )
 @click.option(
     "--fixed",

@@ -46,7 +46,7 @@ from ambiguous_wild.simulate.photo_render import (
     trace_photo,
 )
 from ambiguous_wild.simulate.room import room
-from ambiguous_wild.simulate.spec import FULL_FRAME_DIAGONAL_MM, CaptureSpec, WorldSpec
+from ambiguous_wild.simulate.spec import FULL_FRAME_DIAGONAL_MM, VIDEO_WALKS, CaptureSpec, WorldSpec
 from ambiguous_wild.simulate.spec_file import plain_spec
 from ambiguous_wild.simulate.tracer import TracedPhoto
 from ambiguous_wild.simulate.truth_records import (
@@ -62,6 +62,9 @@ from ambiguous_wild.simulate.yard import yard
 
 _NEAREST_WALL_M = 0.1
 _AHEAD_M = 4.0  # distance to the point that an outward camera looks at
+_ALONG_DEG, _ALONG_M = 45.0, 1.25  # angle to the point of the arc that a camera along it looks at; its height
+_VIDEO_SHAKE = 0.05  # of a hand that films, relative to that of single photos
+_SHEET = "truth/sheet.jpg"  # written by the command line, of the finished capture
 _LENS_MM = 4.2  # focal length without zoom
 _ISO = 64
 _DATE = "2025:06:14 15:{:02d}:{:02d}"
@@ -92,20 +95,21 @@ def plan_cameras(
     """Plan train cameras along an arc with varying distance and height, and test cameras within their range.
 
     Test viewpoints have other angles than the train photos, and distances and heights between those of train
-    photos. An outward walk goes around the hub and looks away from it.
+    photos. An outward walk goes around the hub and looks away from it; a walk along the arc looks where it
+    goes. Train cameras of a video have equal steps and hardly shake.
 
     Raises:
         AwError: the walk leads into a wall.
     """
     half = np.deg2rad(spec.arc_deg / 2)
     phase = rng.uniform(0, 2 * np.pi, 2)
-    outward = spec.walk == "outward"
+    outward, along, video = spec.walk == "outward", spec.walk == "along", spec.walk in VIDEO_WALKS
     plan = world.plan
 
     def camera(azimuth: float, sway: float, rise: float, shake: float) -> Camera:
         radius = np.interp(sway, (-1, 1), spec.radius_m)
         height = np.interp(rise, (-1, 1), spec.eye_m)
-        center = np.array([world.hub[0], world.hub[1] - (0.0 if outward else 0.3)])
+        center = np.array([world.hub[0], world.hub[1] - (0.0 if outward or along else 0.3)])
         direction = np.array([np.sin(azimuth), -np.cos(azimuth)])
         eye = np.array([*(center + radius * direction), height])
         behind = "wall_front" in plan.walls and eye[1] < plan.y_m[0] + _NEAREST_WALL_M
@@ -121,6 +125,9 @@ def plan_cameras(
         target = np.array([*center, 1.25])
         if outward:  # straight away from the hub
             target = np.array([*(eye[:2] + _AHEAD_M * direction), height + 0.1])
+        if along:
+            later = azimuth + np.deg2rad(_ALONG_DEG)
+            target = np.array([*(center + radius * np.array([np.sin(later), -np.cos(later)])), _ALONG_M])
         target = target + rng.normal(0, 0.16, 3) * shake
         f = focal_px(spec)
         pose = look_at(eye, target, float(rng.normal(0, 1.2)) * shake)
@@ -128,12 +135,13 @@ def plan_cameras(
 
     turn_round = spec.arc_deg >= 360  # the last photo stands beside the first one
     step = 2 * half / (spec.train_views - (0 if turn_round else 1))
+    jitter = 0.0 if video else 0.25
     train = []
     for k in range(spec.train_views):
-        azimuth = -half + step * (k + (rng.uniform(-0.25, 0.25) if 0 < k < spec.train_views - 1 else 0))
+        azimuth = -half + step * (k + (rng.uniform(-jitter, jitter) if 0 < k < spec.train_views - 1 else 0))
         turn = 2 * np.pi * 3 * k / spec.train_views
         sway, rise = np.sin(turn + phase[0]), np.sin(1.7 * turn + phase[1])
-        train.append(camera(azimuth, float(sway), float(rise), 1.0))
+        train.append(camera(azimuth, float(sway), float(rise), _VIDEO_SHAKE if video else 1.0))
     test = []
     for k in range(spec.test_views):
         gap = round((k + 0.5) / spec.test_views * (spec.train_views - 1) - 0.5)
@@ -285,7 +293,7 @@ def _write_photo(
         pixels: [H, W, 3] uint8.
         spec: spec of the capture.
         camera: the photo's camera, which gives the focal length.
-        number: the photo's number, which gives the time: one photo every four seconds.
+        number: the photo's number, which gives the time: one photo every four seconds; not of a video.
         drawn: the photo's effects, which give exposure, ISO and white balance.
     """
     from PIL import Image
@@ -300,15 +308,15 @@ def _exif(spec: CaptureSpec, camera: Camera, number: int, drawn: DrawnEffects) -
         return TiffImagePlugin.IFDRational(round(value * 10000), 10000)
 
     zoom = camera.fx / focal_px(spec)
-    taken = _DATE.format(number * 4 // 60 % 60, number * 4 % 60)
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = "ambiguous_wild", "simulated phone"
-    exif[0x0131], exif[0x0132] = f"ambiguous_wild {__version__}", taken
+    exif[0x0131] = f"ambiguous_wild {__version__}"
     fields = exif.get_ifd(0x8769)
+    if spec.walk not in VIDEO_WALKS:
+        exif[0x0132] = fields[0x9003] = fields[0x9004] = _DATE.format(number * 4 // 60 % 60, number * 4 % 60)
     fields[0x829A] = _exposure(drawn, TiffImagePlugin.IFDRational)  # ExposureTime, s
     fields[0x829D] = rational(1.6)  # FNumber
     fields[0x8827] = round(drawn["iso_noise"]["iso"]) if "iso_noise" in drawn else _ISO
-    fields[0x9003] = fields[0x9004] = taken
     fields[0x920A] = rational(_LENS_MM * zoom)
     fields[0xA402] = 0 if "exposure_drift" in drawn else 1  # exposure: automatic or manual
     fields[0xA403] = 0 if "white_balance" in drawn else 1  # white balance: automatic or manual
@@ -418,7 +426,7 @@ def _earlier(out: Path, identity: str, overwrite: bool) -> CaptureTruth | None:
         return cast(CaptureTruth, facts)
     if overwrite:
         if files:
-            refuse_foreign_files(out, {record.relative_to(out).as_posix(), *files})
+            refuse_foreign_files(out, {record.relative_to(out).as_posix(), _SHEET, *files})
         return None
     why = "with files changed since" if same else "of other settings or another version"
     raise AwError(f"{out} holds a capture ({kind}) {why}; add --overwrite to replace it or choose another -o")

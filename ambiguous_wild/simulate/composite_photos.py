@@ -9,7 +9,8 @@ RAW/truth/composite.json            config, cut-outs with sha256; per photo sour
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,12 @@ _MAX_PIECES = 3  # largest number of pieces in a photo
 _SPREAD = (0.5, 1.5)  # range of a photo's coverage, relative to the mean
 _MAX_COVER = 0.6  # largest mean coverage of photos with distractors
 _MIDDLE = (0.15, 0.85)  # range of a piece's middle, relative to the photo's sides
+_CROSSING = (14.0, 28.0)  # photos that a group of pieces takes to cross the picture, with `path`
+_FASTER = (0.5, 0.9)  # range of the time of faster pieces of the group, relative to that of the slowest
+_GROWTH = (0.8, 1.25)  # factor on a piece's size where it enters and where it leaves
+_DRIFT = 0.1  # greatest way up or down while it crosses, relative to the photo's height
+
+_Drawn = tuple[Cutout, str, bool]  # piece, photo that it was cut from (empty for cut-outs), mirrored or not
 
 
 def is_photo_folder(path: Path | str) -> bool:
@@ -75,8 +82,8 @@ def composite_photos(
     Args:
         source: folder of at least six photos without distractors; every sixth becomes a test photo.
         output: the folder to write; it appears complete or not at all.
-        config: only coverage, presence (share of train photos with distractors), patches, fixed and seed are
-            used.
+        config: only coverage, presence (share of train photos with distractors), patches, path, fixed and
+            seed are used. With ``path`` the photos are a sequence in the order of their names.
         cutouts: folder of PNG files with alpha; may be None with ``config.patches`` or ``config.fixed``.
         progress: wraps the photos, for a bar.
 
@@ -100,6 +107,10 @@ def composite_photos(
     chosen = {train[i] for i in order[: max(1, round(config.presence * len(train)))]}
     if cutouts is None and not config.patches:
         chosen = set()
+    tracks: list[_Track] = []
+    if config.path:
+        numbers = [i for i, test in enumerate(is_test) if not test]
+        tracks = _tracks(shapes, paths, numbers, config, np.random.default_rng(choice_seed))
     photos: dict[str, Facts] = {}
     shares: list[float] = []
     with atomic_dir(target, replace=False) as folder:
@@ -112,12 +123,17 @@ def composite_photos(
                 _write_jpeg(folder / "test" / name, clean, exif)
                 continue
             over, pieces = np.zeros((*clean.shape[:2], 4), np.float32), list[Facts]()
-            if path in chosen:
+            if tracks:
+                now, middles, heights = _under_way(tracks, number, clean.shape)
+                over, pieces = _pasted([tracks[k].piece for k in now], middles, heights, clean.shape)
+                pieces = [{**piece, "track": k} for piece, k in zip(pieces, now, strict=True)]
+            elif path in chosen:
                 rng = np.random.default_rng(seed)
                 cover = float(mean * rng.uniform(*_SPREAD))
                 others = [p for p in train if p != path]
                 area = cover * clean.shape[0] * clean.shape[1]
-                drawn = _draw(shapes, others, area, config.patches, rng)
+                count = int(rng.integers(1, _MAX_PIECES + 1))
+                drawn = _draw(shapes, others, area, count, config.patches, rng)
                 over, pieces = _layer(drawn, clean.shape, cover, rng)
             if config.fixed is not None:
                 over = _with_fixed(config.fixed, clean, over, number, config.seed)
@@ -229,10 +245,9 @@ def _write_jpeg(path: Path, pixels: np.ndarray, exif: Exif) -> None:
 
 
 def _draw(
-    shapes: list[Cutout], others: list[Path], area: float, patches: bool, rng: np.random.Generator
-) -> list[tuple[Cutout, str, bool]]:
-    """Draw one to three pieces that fill `area` px: cut-out, photo that it was cut from, mirrored or not."""
-    count = int(rng.integers(1, _MAX_PIECES + 1))
+    shapes: list[Cutout], others: list[Path], area: float, count: int, patches: bool, rng: np.random.Generator
+) -> list[_Drawn]:
+    """Draw pieces that fill `area` px: cut-out, photo that it was cut from, mirrored or not."""
     shown = [shapes[int(rng.integers(len(shapes)))] for _ in range(count)] if shapes else blobs(rng)[:count]
     drawn = []
     for cutout in shown:
@@ -248,19 +263,34 @@ def _draw(
 
 
 def _layer(
-    drawn: list[tuple[Cutout, str, bool]], size: tuple[int, ...], cover: float, rng: np.random.Generator
+    drawn: list[_Drawn], size: tuple[int, ...], cover: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, list[Facts]]:
     """Draw the pieces at random places as a layer, at the size at which they cover `cover`."""
     cutouts, (height, width) = [cutout for cutout, _, _ in drawn], size[:2]
     middles = rng.uniform(*_MIDDLE, (len(drawn), 2))  # x and y over width and height
-    places = enumerate(middles * [width / height, 1.0])
-    placements = [CutoutPlacement(k, (float(x), float(y), 1.0), 0.0, False) for k, (x, y) in places]
+    placements = _placements(middles, size)
     natural, small = natural_heights(cutouts, rng), [c.reduced(PREVIEW_PX) for c in cutouts]
     preview = _camera(width, height, PREVIEW_PX / max(width, height))
     high = LONGEST * max(1.0, width / height) / longest_side(natural, cutouts)
     scale = bisected(lambda scale: covered(small, natural * scale, placements, preview), high, cover)
-    heights = natural * scale
-    over = layer(cutouts, list(heights), placements, _camera(width, height, 1.0))
+    return _pasted(drawn, middles, natural * scale, size)
+
+
+def _placements(middles: np.ndarray, size: tuple[int, ...]) -> list[CutoutPlacement]:
+    """Place pieces by their middles [K, 2], x and y over width and height."""
+    places = enumerate(middles * [size[1] / size[0], 1.0])
+    return [CutoutPlacement(k, (float(x), float(y), 1.0), 0.0, False) for k, (x, y) in places]
+
+
+def _pasted(
+    drawn: list[_Drawn],
+    middles: np.ndarray,  # [K, 2] x and y over width and height
+    heights: np.ndarray,  # [K] over the photo's height
+    size: tuple[int, ...],
+) -> tuple[np.ndarray, list[Facts]]:
+    """Draw the pieces at their places as a layer, with their records."""
+    camera = _camera(size[1], size[0], 1.0)
+    over = layer([c for c, _, _ in drawn], list(heights), _placements(middles, size), camera)
     over[over[..., 3] < TRUTH_COVER] = 0  # pixels that the mask leaves out keep their bytes
     pieces: list[Facts] = [
         {
@@ -274,6 +304,99 @@ def _layer(
         for (c, p, m), (x, y), tall in zip(drawn, middles, heights, strict=True)
     ]
     return over, pieces
+
+
+@dataclass(frozen=True)
+class _Track:
+    """A piece that crosses the picture at constant speed: it enters at one side and leaves at the other."""
+
+    piece: _Drawn
+    start: float  # number of the photo that it enters after
+    photos: float  # that it takes to cross
+    leftwards: bool
+    y: tuple[float, float]  # middle where it enters and leaves, over the photo's height
+    height: tuple[float, float]  # where it enters and leaves, over the photo's height
+
+
+def _tracks(
+    shapes: list[Cutout],
+    paths: list[Path],
+    train: list[int],
+    config: CompositeConfig,
+    rng: np.random.Generator,
+) -> list[_Track]:
+    """Draw groups of pieces that cross one after another, at the size that gives the configured coverage.
+
+    Args:
+        shapes: cut-outs; none: rounded shapes.
+        paths: photos of the sequence; the first one's size stands for all.
+        train: numbers of the train photos.
+        config: coverage, presence, patches.
+        rng: source of randomness.
+
+    Raises:
+        AwError: even the largest pieces cover less.
+    """
+    size = _read(paths[train[0]])[0].shape
+    area = config.coverage / config.presence * size[0] * size[1]
+    tracks: list[_Track] = []
+    begin, lasts = 0.0, rng.uniform(*_CROSSING)  # of a group, in photos
+    begin -= lasts * rng.random()  # the first is under way, so that a short sequence shows distractors, too
+    while begin < len(paths):
+        others = [paths[n] for n in train if not begin < n < begin + lasts] or [paths[n] for n in train]
+        drawn = _draw(shapes, others, area, _MAX_PIECES, config.patches, rng)
+        for k, (piece, tall) in enumerate(zip(drawn, natural_heights([c for c, _, _ in drawn], rng))):
+            photos = lasts * (rng.uniform(*_FASTER) if k else 1.0)
+            y = rng.uniform(*_MIDDLE)
+            ends = (y, float(np.clip(y + rng.uniform(-_DRIFT, _DRIFT), *_MIDDLE)))
+            first, last = tall * rng.uniform(*_GROWTH, 2)
+            start, leftwards = begin + (lasts - photos) * rng.random(), bool(rng.random() < 0.5)
+            tracks.append(_Track(piece, start, photos, leftwards, ends, (first, last)))
+        begin += lasts / config.presence
+        lasts = rng.uniform(*_CROSSING)
+    preview = _camera(size[1], size[0], PREVIEW_PX / max(size[:2]))
+    small = [replace(t, piece=(t.piece[0].reduced(PREVIEW_PX), *t.piece[1:])) for t in tracks]
+
+    def share(scale: float) -> float:
+        shares = []
+        for number in train:
+            now, middles, heights = _under_way(_scaled(small, scale, size), number, size)
+            shown, placements = [small[k].piece[0] for k in now], _placements(middles, size)
+            shares.append(covered(shown, heights, placements, preview))
+        return float(np.mean(shares))
+
+    high = LONGEST * max(1.0, size[1] / size[0]) / min(min(t.height) for t in tracks)
+    if share(high) < config.coverage:
+        raise AwError(
+            f"--coverage {config.coverage:g} is more than --path can cover ({share(high):.2f} with the "
+            "largest pieces); lower it or raise --presence"
+        )
+    return _scaled(tracks, bisected(share, high, config.coverage), size)
+
+
+def _scaled(tracks: Sequence[_Track], scale: float, size: tuple[int, ...]) -> list[_Track]:
+    """Scale the pieces, none of them beyond the largest size."""
+    longest = LONGEST * max(1.0, size[1] / size[0])
+    limits = [longest / max(1.0, t.piece[0].aspect) for t in tracks]
+    return [
+        replace(t, height=(min(scale * t.height[0], limit), min(scale * t.height[1], limit)))
+        for t, limit in zip(tracks, limits, strict=True)
+    ]
+
+
+def _under_way(
+    tracks: Sequence[_Track], number: int, size: tuple[int, ...]
+) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Return indices [K] of the tracks in a photo, middles [K, 2] over its sides, and heights [K]."""
+    now = [k for k, t in enumerate(tracks) if t.start < number < t.start + t.photos]
+    middles, heights = np.zeros((len(now), 2)), np.zeros(len(now))
+    for k, track in enumerate(tracks[i] for i in now):
+        s = (number - track.start) / track.photos
+        heights[k] = np.interp(s, (0, 1), track.height)
+        half = heights[k] * track.piece[0].aspect / 2 * size[0] / size[1]
+        x = s * (1 + 2 * half) - half
+        middles[k] = 1 - x if track.leftwards else x, np.interp(s, (0, 1), track.y)
+    return now, middles, heights
 
 
 def _camera(width: int, height: int, scale: float) -> Camera:

@@ -79,6 +79,11 @@ def composite(
     root, target = Path(source), Path(output)
     name = check_name("scene name (the folder's)", target.resolve().name)
     check_request(root, target, config, cutouts)
+    if config.path:
+        raise AwError(
+            f"--path is for plain photos in the order of their names, and {root} is a scene; give the folder "
+            "of its original photos"
+        )
     if config.fixed is not None:
         raise AwError(
             f"--fixed is for plain photos, and {root} is a scene, whose poses were found without; give "
@@ -112,6 +117,8 @@ def check_request(root: Path, target: Path, config: CompositeConfig, cutouts: Pa
             "no distractors are given: pass --cutouts FOLDER of PNG files with alpha, --patches, or (plain "
             "photos) --fixed"
         )
+    if config.path and cutouts is None and not config.patches:
+        raise AwError("--path moves cut-outs, and none are given: pass --cutouts FOLDER or --patches")
 
 
 def _check_scene(scene: Scene) -> None:

@@ -24,6 +24,9 @@ _SAME_PLACE_SHARE = 0.15  # largest share of the photos with one distractor at t
 _APART_M = 0.75
 _CLEARANCE_M = {"car": 1.2}  # distance from static objects; other distractors keep 0.3 m
 _PREVIEW_PX = 96
+_STRIDES_M = 0.35  # strides of a walker per metre
+# A followed person sways: angle to either side; cycles per photo of the sway, the distance and the stride.
+_SWAY_DEG, _SWAY, _NEARING, _STEPS = 7.0, 0.07, 0.045, 0.13
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ def lay_out(
     light = replace(world.light, sun=np.ascontiguousarray(world.light.sun[:1]))  # one sample a pixel
     low, high = spec.occlusion
     # The place of a walker is given, and choosing among layouts would change how often it is present.
-    tries = 1 if all(d.path == "walk" for d in spec.distractors) else _TRIES
+    tries = 1 if all(d.path != "elsewhere" for d in spec.distractors) else _TRIES
     for camera in cameras:
         if not spec.distractors:
             chosen.append(())
@@ -150,6 +153,11 @@ def _draw(
             if away >= distractor.distance_m[0] and _is_free(place, world, [], distractor):
                 layout.append(place)
             continue
+        if distractor.path == "ahead":
+            place = _placement_ahead(which, distractor, camera, len(earlier))
+            if _is_free(place, world, [], distractor):
+                layout.append(place)
+            continue
         for _ in range(12):
             place = _random_placement(which, distractor, camera, rng)
             if _is_free(place, world, layout, distractor) and _is_fresh(place, earlier, spec.train_views):
@@ -181,8 +189,20 @@ def _walker_placement(which: int, distractor: Distractor, progress: float) -> Di
     x, y = corners[leg] + share * (corners[leg + 1] - corners[leg])
     ahead = (corners[leg + 1] - corners[leg]) * (1 if there else -1)
     yaw = np.rad2deg(np.arctan2(ahead[1], ahead[0])) + 90.0  # figures face -y
-    stride = 0.5 + 0.5 * np.sin(2 * np.pi * 0.35 * 2 * distractor.laps * progress * legs.sum())
+    stride = 0.5 + 0.5 * np.sin(2 * np.pi * _STRIDES_M * 2 * distractor.laps * progress * legs.sum())
     return DistractorPose(which, float(x), float(y), float(yaw), float(stride))
+
+
+def _placement_ahead(which: int, distractor: Distractor, camera: Camera, number: int) -> DistractorPose:
+    """Place a person whom the camera follows: in front of it, swaying slowly, seen from behind."""
+    sway, nearing, stride = (np.sin(2 * np.pi * f * number + which) for f in (_SWAY, _NEARING, _STEPS))
+    forward = camera.cam_from_world[2, :2]
+    heading = np.arctan2(forward[1], forward[0])
+    aside = heading + np.deg2rad(_SWAY_DEG) * sway
+    away = np.interp(nearing, (-1, 1), distractor.distance_m)
+    x, y = camera.center[:2] + away * np.array([np.cos(aside), np.sin(aside)])
+    yaw = np.rad2deg(heading) + 90.0  # figures face -y
+    return DistractorPose(which, float(x), float(y), float(yaw), float(0.5 + 0.5 * stride))
 
 
 def _is_free(

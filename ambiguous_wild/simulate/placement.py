@@ -42,6 +42,7 @@ class CompositeConfig:
     pose: Literal["standing", "lying"] = "standing"  # upright; or seen from above, at any angle
     shadow: float = 0.0  # 0 (none) to 1 (black)
     patches: bool = False  # fill the shapes with the scene's own texture
+    path: bool = False  # pieces cross the picture from photo to photo; plain photos only
     fixed: FixedThing | None = None  # fixed to the camera, in all photos, test photos too; plain photos only
     seed: int = 0
 

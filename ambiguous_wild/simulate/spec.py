@@ -30,6 +30,7 @@ FixedThing = Literal["bonnet", "stamp"]  # a car's bonnet, a burnt-in time stamp
 Ambiguity = Literal["colour", "semantic", "none"]
 Colour = tuple[float, float, float]  # linear light
 FULL_FRAME_DIAGONAL_MM = 43.2666  # of 36 x 24 mm, what `focal_35mm` is an equivalent on
+VIDEO_WALKS = ("orbit", "along")  # photos are every tenth frame of a video at 30 frames a second
 STATUES = ("bust", "knot", "hound", "spire")  # signed-distance shapes, in the world and as distractors
 POSTERS = ("coffee", "rocket", "chelsea", "hubble", "coins", "camera", "retina")
 # Textures of objects and distractors; `brick` and `gravel` also cover the courtyard's walls and ground,
@@ -93,7 +94,7 @@ class Designed:
 
 @dataclass(frozen=True)
 class Distractor:
-    """An object that has another place in every photo, or walks through the capture."""
+    """An object that has another place in every photo, walks through the capture, or is followed."""
 
     name: str
     kind: Kind
@@ -103,13 +104,14 @@ class Distractor:
     # Share of the train photos that show it; with path "elsewhere" and `occlusion` above 0, share of the
     # layouts drawn, from which `occlusion` chooses.
     presence: float = 0.85
-    distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera; for a walker only the minimum counts
+    distance_m: tuple[float, float] = (1.9, 4.5)  # from the camera; with path "walk" only the minimum counts
     # factor on the natural size: figures 1.75 m, ball 0.8 m, pole 2 m, statues 1.6 m, car 4.1 m
     size: float = 1.0
     lift_m: float = 0.0  # greatest height above the ground
     tint: Colour = (1.0, 1.0, 1.0)  # factor on the texture, in linear light
-    # elsewhere: a new place in every photo; walk: along `waypoints`
-    path: Literal["elsewhere", "walk"] = "elsewhere"
+    # elsewhere: a new place in every photo; walk: along `waypoints`; ahead: in front of the camera, which
+    # follows it
+    path: Literal["elsewhere", "walk", "ahead"] = "elsewhere"
     waypoints: tuple[tuple[float, float], ...] = ()  # m: x and y of the corners of its walk
     laps: float = 1.0  # times it walks there and back during the capture
 
@@ -264,7 +266,9 @@ class CaptureSpec:
     samples: int = 4  # rays a pixel, a square number
     detail_px_per_m: float = 110.0  # resolution of the textures
     focal_35mm: float = 26.0  # mm, the equivalent that phones state (CIPA: same diagonal angle)
-    walk: Literal["around", "outward"] = "around"  # look at the hub, or stand around it and look away
+    # around: look at the hub; outward: stand around it and look away; orbit and along: frames of a video, at
+    # constant speed, that look at the hub or along the arc
+    walk: Literal["around", "outward", "orbit", "along"] = "around"
     arc_deg: float = 104.0  # arc around the hub that the cameras cover
     radius_m: tuple[float, float] = (4.2, 5.3)  # distance from the hub during the walk
     eye_m: tuple[float, float] = (1.3, 1.8)  # height of the phone

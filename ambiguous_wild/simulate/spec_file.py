@@ -48,6 +48,8 @@ _SPEC: Limits = {
 _WALKS: dict[str, Limits] = {
     "around": {"arc_deg": (5, 150), "radius_m": (1.5, 7)},
     "outward": {"arc_deg": (5, 360), "radius_m": (0.2, 7)},
+    "orbit": {"arc_deg": (5, 150), "radius_m": (1.5, 7)},
+    "along": {"arc_deg": (5, 360), "radius_m": (0.5, 7)},
 }
 _DISTRACTOR: Limits = {
     "size": (0.02, 10),
@@ -229,9 +231,9 @@ def _distractor(where: str, d: Distractor, plan: GroundPlan) -> None:
     _within(where, d, _DISTRACTOR)
     if d.path == "walk" and len(d.waypoints) < 2:
         raise AwError(f"{where}waypoints: a walk needs two corners or more, [[x, y], [x, y]] in metres")
-    if d.path == "elsewhere" and d.waypoints:
+    if d.path != "walk" and d.waypoints:
         raise AwError(f"{where}waypoints: only read with 'path: walk'; add that or leave them out")
-    if d.path == "elsewhere" and d.laps != Distractor.laps:
+    if d.path != "walk" and d.laps != Distractor.laps:
         raise AwError(f"{where}laps: only read with 'path: walk'; add that or leave it out")
     for x, y in d.waypoints:
         _between(f"{where}waypoints x", x, plan.x_m[0] + 0.6, plan.x_m[1] - 0.6)

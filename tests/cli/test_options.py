@@ -47,7 +47,8 @@ def test_an_option_of_one_name_has_one_kind_of_value() -> None:
         for flag, option in options.items():
             kinds[flag][_kind(option)].add(command)
     differ = {flag: dict(found) for flag, found in kinds.items() if len(found) > 1}
-    assert set(differ) == {"--overwrite"}, differ  # a flag, or never | missing | always; see below
+    # --overwrite: a flag, or never | missing | always, see below; --path: a flag, or the path of a camera
+    assert set(differ) == {"--overwrite", "--path"}, differ
 
 
 def test_the_same_meaning_has_the_same_name() -> None:

@@ -46,6 +46,7 @@ def test_a_capture_is_counted_and_the_next_command_can_be_pasted(tmp_path: Path)
     assert "already there, unchanged" in printed(*TINY, "-o", out)
     facts = json.loads(printed(*TINY, "-o", out, "--json"))
     assert facts["reused"] and facts["preset"] == "tiny" and 0 < facts["occlusion"]["mean"] < 1
+    assert "wrote" in printed(*TINY, "-o", out, "--seed", 1, "--overwrite")  # its sheet is its own
 
 
 def test_a_composite_is_counted_and_its_facts_lie_in_the_scene(commands, tmp_path: Path) -> None:

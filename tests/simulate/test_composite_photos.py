@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ NAMES = [f"p{i:02d}" for i in range(13)]
 TEST = ["p03", "p09"]
 TRAIN = [n for n in NAMES if n not in TEST]
 CONFIG = CompositeConfig(coverage=0.15, patches=True, seed=3)
+SEQUENCE = [f"f{i:03d}" for i in range(60)]
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +58,16 @@ def cutouts(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("made") / "raw"
     composite_photos(photos, out, CONFIG)
+    return out
+
+
+@pytest.fixture(scope="module")
+def sequence(cutouts: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Composite with `path` of 60 grey photos."""
+    source, out = tmp_path_factory.mktemp("sequence"), tmp_path_factory.mktemp("made") / "raw"
+    for name in SEQUENCE:
+        _write_jpeg(source / f"{name}.jpg", np.full((72, 128, 3), 128, np.uint8), Exif())
+    composite_photos(source, out, replace(CONFIG, patches=False, path=True), cutouts)
     return out
 
 
@@ -171,6 +183,7 @@ def test_the_command_says_what_comes_next(photos: Path, tmp_path: Path) -> None:
     ("words", "expected"),
     [
         ([], "--cutouts FOLDER"),
+        (["--path", "--fixed", "stamp"], "--path moves cut-outs, and none are given"),
         (["--patches", "--pose", "lying"], "--pose needs the depths"),
         (["--patches", "--shadow", "0.5"], "--shadow needs the depths"),
         (["--patches", "--coverage", "0.5", "--presence", "0.3"], "raise --presence"),
@@ -197,3 +210,56 @@ def test_few_damaged_and_equal_names_leave_nothing(photos: Path, tmp_path: Path)
     with pytest.raises(AwError, match=r"same name: P05.png, p05.jpg; rename"):
         composite_photos(folder, out, CONFIG)
     assert [p.name for p in tmp_path.iterdir()] == ["photos"]
+
+
+def test_on_a_path_pieces_move_alike_from_photo_to_photo(sequence: Path) -> None:
+    facts = json.loads((sequence / "truth/composite.json").read_text())
+    ways: dict[int, list[tuple[int, float, float, float]]] = {}
+    for name, photo in facts["photos"].items():
+        for piece in photo["distractors"]:
+            at = (int(Path(name).stem[1:]), piece["x"], piece["y"], piece["height"])
+            ways.setdefault(piece["track"], []).append(at)
+    speeds = []
+    for way in (np.array(way) for way in ways.values() if len(way) > 3):
+        steps = np.diff(way[:, 1:], axis=0) / np.diff(way[:, :1], axis=0)  # a photo, also across test photos
+        speeds.append(steps[:, 0].mean())
+        assert np.ptp(steps[:, 0]) < 1e-6 + 0.2 * abs(speeds[-1])  # the same speed, but for the growth
+        assert np.ptp(steps[:, 1]) < 1e-9 and np.abs(steps[:, 1:]).max() < 0.1
+        assert 0.02 < abs(speeds[-1]) < 0.25
+    assert len(speeds) > 5 and np.ptp(np.abs(speeds)) > 0.02 and min(speeds) < 0 < max(speeds)
+
+
+def test_on_a_path_pieces_enter_and_leave_and_masks_are_exact(sequence: Path) -> None:
+    facts = json.loads((sequence / "truth/composite.json").read_text())
+    shares = [photo["occlusion"] for photo in facts["photos"].values()]
+    assert facts["occlusion"]["mean"] == pytest.approx(CONFIG.coverage, rel=0.1)
+    assert np.mean(np.array(shares) > 0) == pytest.approx(CONFIG.presence, abs=0.15)
+    assert np.abs(np.diff(shares)).max() < 0.2  # nothing appears all at once
+    always = np.full((72, 128), True)
+    for name in facts["photos"]:
+        mask = read_gray(sequence / "truth/distractor" / f"{Path(name).stem}.png") > 0
+        clean = read_png_rgb(sequence / "truth/clean" / f"{Path(name).stem}.png")
+        photo = np.asarray(Image.open(sequence / "train" / name)).astype(int)
+        gap = np.abs(photo - clean).max(2)
+        assert (gap[mask] > 20).mean() > 0.95 if mask.any() else not gap.any()
+        assert (gap[~mask] > 60).mean() < 0.02  # JPEG at the edges
+        always &= mask
+    assert not always.any()
+    assert len(list((sequence / "test").iterdir())) == 10
+
+
+def test_on_a_path_the_seed_decides_every_byte(photos: Path, tmp_path: Path) -> None:
+    for name, seed in (("one", 0), ("again", 0), ("other", 1)):
+        composite_photos(photos, tmp_path / name, replace(CONFIG, path=True, presence=1.0, seed=seed))
+    one, again, other = (hashes(tmp_path / name) for name in ("one", "again", "other"))
+    assert one == again and one != other
+
+
+def test_on_a_path_strips_cannot_cover_much(photos: Path, tmp_path: Path) -> None:
+    rgba = np.zeros((12, 400, 4), np.uint8)
+    rgba[1:-1, 1:-1] = 255
+    (tmp_path / "cutouts").mkdir()
+    Image.fromarray(rgba).save(tmp_path / "cutouts/strip.png")
+    with pytest.raises(AwError, match=r"--coverage 0.4 is more than --path can cover \(0\.\d\d with"):
+        composite_photos(photos, tmp_path / "raw", CompositeConfig(0.4, path=True), tmp_path / "cutouts")
+    assert [p.name for p in tmp_path.iterdir()] == ["cutouts"]

@@ -91,6 +91,8 @@ def test_a_scene_has_poses_already(tmp_path: Path) -> None:
     (tmp_path / "scene").mkdir()
     with pytest.raises(AwError, match="--fixed is for plain photos"):
         composite(tmp_path / "scene", tmp_path / "out", CompositeConfig(fixed="bonnet"))
+    with pytest.raises(AwError, match="--path is for plain photos"):
+        composite(tmp_path / "scene", tmp_path / "out", CompositeConfig(path=True, patches=True))
 
 
 def test_the_preset_has_it_in_train_photos_with_exact_masks(tmp_path: Path) -> None:

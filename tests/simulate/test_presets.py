@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import ndimage
 
 from ambiguous_wild.core.camera import Camera
@@ -15,7 +17,7 @@ from ambiguous_wild.simulate.capture_writer import look_at
 from ambiguous_wild.simulate.distractors import DistractorPose, movers
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.shapes import shape_table
-from ambiguous_wild.simulate.spec import CaptureSpec, Distractor
+from ambiguous_wild.simulate.spec import VIDEO_WALKS, CaptureSpec, Distractor
 from ambiguous_wild.simulate.tracer import trace
 from ambiguous_wild.simulate.world import World
 
@@ -28,6 +30,7 @@ STATED = {
     "courtyard-crowd": (0.41, 0.49),
 }
 THIN = ("pole", "barrier", "banner")
+VIDEOS = [name for name, spec in PRESETS.items() if spec.walk in VIDEO_WALKS]
 
 
 def small(name: str, views: int = 8, width: int = 128) -> CaptureSpec:
@@ -121,3 +124,64 @@ def test_plain_colours_are_nothing_elses() -> None:
                 share.append((pure[there].mean(), pure[seen.owner == 0].mean()))
     inside, outside = np.array(share).T
     assert len(share) > 6 and inside.mean() > 0.6 and outside.mean() < 0.05
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_consecutive_photos_of_a_video_are_close(name: str) -> None:
+    """Steps of cameras and people are small and alike, and the next photo shows 80 % of a photo."""
+    spec = small(name, views=PRESETS[name].train_views, width=64)
+    for seed in range(2):
+        world, shots = capture_writer.plan(spec, seed)
+        train = [s for s in shots if s.split == "train"]
+        assert [s.name for s in train] == sorted(s.name for s in train)
+        steps = np.linalg.norm(np.diff([s.camera.center for s in train], axis=0), axis=1)
+        assert steps.min() > 0.2 and steps.max() < min(0.4, 1.2 * steps.min())
+        for which in range(len(spec.distractors)):
+            places = {
+                k: np.array([p.x_m, p.y_m])
+                for k, s in enumerate(train)
+                for p in s.placements
+                if p.which == which
+            }
+            walked = [np.linalg.norm(places[k + 1] - places[k]) for k in places if k + 1 in places]
+            assert len(walked) > 20 and max(walked) < 0.55
+        nothing = shape_table((), world.atlas)
+        for a, b in zip(train[::5], train[1::5]):
+            depth = trace(a.camera, world.table(), nothing, world.atlas, world.light).depth_m
+            assert seen_by(b.camera, points_of(a.camera, depth)).mean() > 0.8
+
+
+def points_of(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """World points [N, 3] of the pixels with a depth below 50 m."""
+    rows, columns = np.nonzero(depth < 50)
+    z = depth[rows, columns]
+    local = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy], 1)
+    local = np.column_stack([local * z[:, None], z])
+    return (local - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3]
+
+
+def seen_by(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Tell which points [N, 3] lie within the camera's picture."""
+    local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    uv = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    return (local[:, 2] > 0) & (uv > 0).all(1) & (uv < [camera.width, camera.height]).all(1)
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_most_photos_of_a_video_show_its_people(name: str) -> None:
+    owner = masks(small(name, views=PRESETS[name].train_views, width=96), 0)
+    shares = (owner > 0).mean(axis=(1, 2))
+    assert 0.04 < shares.mean() < 0.25 and shares.max() < 0.3 and (shares > 0.01).mean() > 0.75
+    assert np.abs(np.diff(shares)).max() < 0.13
+    still = (owner > 0).mean(0)  # share of the photos in which a pixel is covered
+    assert still.max() < 0.8 or name == "followed"
+    if name == "followed":  # the person keeps its place
+        middles = [np.nonzero(mask)[1].mean() for mask in owner]
+        assert np.ptp(middles) < 0.3 * 96 and np.abs(np.diff(middles)).max() < 0.1 * 96
+
+
+def test_photos_of_a_video_have_no_time(tmp_path: Path) -> None:
+    spec = replace(small("passer-by", views=3, width=64), test_views=1)
+    capture_writer.simulate(spec, tmp_path / "raw")
+    tags = Image.open(tmp_path / "raw/train/IMG_0001.jpg").getexif()
+    assert 0x0132 not in tags and 0x9003 not in tags.get_ifd(0x8769) and 0x920A in tags.get_ifd(0x8769)

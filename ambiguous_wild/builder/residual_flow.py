@@ -9,7 +9,7 @@ is its residual flow, also for motion along the epipolar line.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -59,6 +59,10 @@ class SequenceFrame:
         (h, w), (rows, columns) = self.map_shape, self.grey.shape
         x, y = (np.arange(w) + 0.5) * (columns / w) - 0.5, (np.arange(h) + 0.5) * (rows / h) - 0.5
         return np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+
+    def contains(self, xy: np.ndarray) -> np.ndarray:
+        """Return which positions [h, w, 2] in px lie in the frame, [h, w] bool."""
+        return np.all((xy >= -0.5) & (xy < np.array(self.grey.shape[::-1]) - 0.5), axis=-1)
 
     def rotation_flow(self, other: SequenceFrame) -> np.ndarray:
         """Return the flow [H, W, 2] float32 that the rotation between two frames causes, of far points."""
@@ -178,8 +182,7 @@ def _matched(frame: SequenceFrame, other: SequenceFrame, there: np.ndarray, back
     differs = cv2.absdiff(looks, cv2.remap(frame.grey, x, y, cv2.INTER_LINEAR))
     returns = away <= RETURNS_PX + RETURNS_SHARE * np.linalg.norm(flow, axis=2)
     differs = cv2.blur(differs.astype(np.float32), (COMPARED, COMPARED))
-    inside = np.all((xy >= -0.5) & (xy < np.array(other.grey.shape[::-1]) - 0.5), axis=2)
-    return Matches(xy, away, returns, differs, inside)
+    return Matches(xy, away, returns, differs, other.contains(xy))
 
 
 def _better(one: Matches, two: Matches) -> Matches:
@@ -205,43 +208,68 @@ def count_votes(
         xyz: [M, 3] points of the static scene that are visible around the frame.
     """
     votes = np.zeros((2, *frame.map_shape), np.uint8)
-    if not others:
-        return votes
-    x, y = frame.map_positions()
-    rays = np.dstack([x, y, np.ones_like(x)]) @ np.linalg.inv(frame.intrinsics).T
     least, greatest = surrounding_inverse_depths(frame, xyz)
-    # a static pixel of inverse depth r is at the projection of `away` + r * `shift` in another frame
-    away, shift = [], []
-    for other, _ in others:
-        relative = other.cam_from_world @ np.linalg.inv(frame.cam_from_world)
-        away.append(rays @ (other.intrinsics @ relative[:3, :3]).T)
-        shift.append(other.intrinsics @ relative[:3, 3])
-    unit = [np.maximum(LEAST_PX, m.return_px) for _, m in others]
-    inverse, residuals = np.zeros(x.shape), [np.zeros(x.shape)] * len(others)
-    nothing = np.full(x.shape, np.inf)
+    neighbours = [_neighbour(frame, other, matches, (least, greatest)) for other, matches in others]
+    inverse, residuals = np.zeros(least.shape), [np.zeros(least.shape)] * len(others)
     for _ in range(FITS):
-        above, below = np.zeros(x.shape), np.full(x.shape, 1e-12)
-        for (_, m), a, b, u, r in zip(others, away, shift, unit, residuals):
-            weight = m.returns / (u * (1.0 + (r / STAYS) ** 2) * (a[..., 2] + inverse * b[2])) ** 2
+        above, below = np.zeros(least.shape), np.full(least.shape, 1e-12)
+        for n, residual in zip(neighbours, residuals):
+            unit = n.unit_px * (1.0 + (residual / STAYS) ** 2) * (n.away[..., 2] + inverse * n.shift[2])
             for axis in range(2):
-                slope = m.xy[..., axis] * b[2] - b[axis]
-                above += weight * slope * (a[..., axis] - m.xy[..., axis] * a[..., 2])
-                below += weight * slope**2
+                slope = n.xy[..., axis] * n.shift[2] - n.shift[axis]
+                above += n.valid / unit**2 * slope * (n.away[..., axis] - n.xy[..., axis] * n.away[..., 2])
+                below += n.valid / unit**2 * slope**2
         inverse = np.maximum(above / below, BEHIND * least)
-        residuals = []
-        for (_, m), a, b, u in zip(others, away, shift, unit):
-            projected = a + inverse[..., None] * b
-            depth = np.maximum(projected[..., 2:], 1e-6)
-            distance = np.linalg.norm(projected[..., :2] / depth - m.xy, axis=2)
-            # errors of poses and of flow are alike everywhere in a pair
-            typical = 1.48 * float(np.median(distance[m.returns]))
-            residuals.append(distance / np.maximum(u, typical) if typical <= MOST_PX else nothing)
+        residuals = [n.residual(inverse) for n in neighbours]
     # an imported model may have no points, and then nothing is known of depths
-    near = (inverse <= IN_FRONT * greatest) & (least > 0) if len(xyz) else np.ones(x.shape, bool)
-    for (_, m), r in zip(others, residuals):
-        votes[0] += m.returns & (r <= STAYS) & near
-        votes[1] += m.returns & (r >= MOVES) & (r < np.inf)
+    near = (inverse <= IN_FRONT * greatest) & (least > 0) if len(xyz) else np.ones(least.shape, bool)
+    for n, residual in zip(neighbours, residuals):
+        votes[0] += n.valid & (residual <= STAYS) & near
+        votes[1] += n.valid & (residual >= MOVES) & np.isfinite(residual)
     return votes
+
+
+@dataclass(frozen=True)
+class _Neighbour:
+    """Another frame: a static pixel of inverse depth r is at the projection of `away` + r * `shift` in it."""
+
+    away: np.ndarray  # [h, w, 3]
+    shift: np.ndarray  # [3]
+    xy: np.ndarray  # [h, w, 2] px, the matches
+    unit_px: np.ndarray  # [h, w], uncertainty of the matches
+    valid: np.ndarray  # [h, w] bool: the match returns, and the frame shows the static surface, too
+
+    def project(self, inverse: np.ndarray) -> np.ndarray:
+        """Return x and y in px, [h, w, 2], of pixels of these inverse depths [h, w]."""
+        ahead = self.away + inverse[..., None] * self.shift
+        return np.asarray(ahead[..., :2] / np.maximum(ahead[..., 2:], 1e-6))
+
+    def residual(self, inverse: np.ndarray) -> np.ndarray:
+        """Return the residual flow [h, w] in units of its uncertainty; inf if the poses do not fit."""
+        distance = np.linalg.norm(self.project(inverse) - self.xy, axis=2)
+        # errors of poses and of flow are alike everywhere in a pair
+        typical = 1.48 * float(np.median(distance[self.valid])) if self.valid.any() else np.inf
+        if typical > MOST_PX:
+            return np.full(distance.shape, np.inf)
+        return np.asarray(distance / np.maximum(self.unit_px, typical))
+
+
+def _neighbour(
+    frame: SequenceFrame, other: SequenceFrame, matches: Matches, depths: tuple[np.ndarray, np.ndarray]
+) -> _Neighbour:
+    x, y = frame.map_positions()
+    relative = other.cam_from_world @ np.linalg.inv(frame.cam_from_world)
+    rays = np.dstack([x, y, np.ones_like(x)]) @ np.linalg.inv(frame.intrinsics).T
+    neighbour = _Neighbour(
+        rays @ (other.intrinsics @ relative[:3, :3]).T,
+        other.intrinsics @ relative[:3, 3],
+        matches.xy,
+        np.maximum(LEAST_PX, matches.return_px),
+        matches.returns,
+    )
+    # what leaves the frame finds a wrong match in it
+    shown = [other.contains(neighbour.project(inverse)) for inverse in depths]
+    return replace(neighbour, valid=matches.returns & shown[0] & shown[1])
 
 
 def surrounding_inverse_depths(frame: SequenceFrame, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from ambiguous_wild.io.motion_points import MotionPoints
-from ambiguous_wild.io.palette import KEPT, MASKED, faded
+from ambiguous_wild.io.palette import KEPT, MASKED, faded, tint
 from ambiguous_wild.vision.precompute import cache_key, cached
 from ambiguous_wild.vision.protocols import Instances
 from ambiguous_wild.vision.sam import SamInstances
@@ -24,7 +24,7 @@ from ambiguous_wild.vision.sparse_surface import PIXELS
 
 MOVES = 0.6  # a pixel moves if `moving_map` is above this
 CERTAIN = 0.8  # and certainly by optical flow, if above this
-POINTS = "features: green stay, red move"  # caption of `draw_points`
+POINTS = "green stays, red moves"  # caption of `draw_points`
 # Reach of a feature: standard deviation in px on a map of `PIXELS`. Static features reach less far, because
 # what hides them may move.
 MOVING_PX, STATIC_PX = 3.0, 2.0
@@ -54,7 +54,7 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
         np.add.at(at_feature, (row, column), weight)
         near.append(cv2.GaussianBlur(at_feature, (0, 0), reach) * np.float32(2.0 * math.pi * reach**2))
         total = np.bincount(segments[row, column], weight, minlength=int(segments.max()) + 1)
-        of_segment.append(total)
+        of_segment.append(total.astype(np.float64))  # without features they are integers
     if points.flow is not None:
         flow = points.flow.astype(np.float32)
         for kind, votes in enumerate(cv2.resize(m, (w, h), interpolation=cv2.INTER_AREA) for m in flow[::-1]):
@@ -101,10 +101,13 @@ def moving_labels(
 
 
 def draw_points(photo: np.ndarray, points: MotionPoints) -> np.ndarray:
-    """Draw dots on a photo [H, W, 3] uint8: red where a feature moves, green where it stays."""
+    """Draw features, and areas by optical flow, on a photo [H, W, 3] uint8: red moves, green stays."""
     h, w = photo.shape[:2]
     size = max(round(max(h, w) / 320), 1)
     shown = faded(photo)
+    if points.flow is not None:
+        stays, moves = (cv2.resize(votes, (w, h), interpolation=cv2.INTER_NEAREST) for votes in points.flow)
+        shown = tint(tint(shown, stays > moves, KEPT), moves > stays, MASKED)
     for chosen, colour in ((~points.moves, KEPT), (points.moves, MASKED)):
         for x, y in (points.xy[chosen] * [w, h]).astype(int).tolist():
             cv2.circle(shown, (x, y), size, colour, -1)

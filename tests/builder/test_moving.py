@@ -18,7 +18,13 @@ from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.export import export_scene
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
-from ambiguous_wild.io.motion_points import FILE, MotionPoints, read_motion_points, write_motion_points
+from ambiguous_wild.io.motion_points import (
+    FILE,
+    NO_POINTS,
+    MotionPoints,
+    read_motion_points,
+    write_motion_points,
+)
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.motion import MotionConfig, MotionMask
@@ -26,7 +32,7 @@ from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.vision.motion_maps import moving_labels, moving_map
+from ambiguous_wild.vision.motion_maps import CERTAIN, MOVES, draw_points, moving_labels, moving_map
 from ambiguous_wild.vision.sam import SamInstances
 from tests.builder import capture_maker
 from tests.builder.capture_maker import HEIGHT, WIDTH, eyes, render
@@ -197,6 +203,7 @@ def test_the_file_comes_back_and_a_damaged_one_is_refused(tmp_path):
         )
         for name, count in (("a.png", 5), ("b.png", 0), ("c.png", 3))
     }
+    points["b.png"] = replace(points["b.png"], flow=rng.integers(0, 5, (2, 6, 8), np.uint8))
     assert read_motion_points(tmp_path) == {}
     write_motion_points(tmp_path / FILE, points)
     again = read_motion_points(tmp_path)
@@ -205,6 +212,7 @@ def test_the_file_comes_back_and_a_damaged_one_is_refused(tmp_path):
         np.testing.assert_array_equal(found.xy, points[name].xy)
         np.testing.assert_array_equal(found.moving, points[name].moving)
         np.testing.assert_array_equal(found.motion, points[name].motion)
+        assert found.flow is None if name != "b.png" else (found.flow == points[name].flow).all()
     whole = (tmp_path / FILE).read_bytes()
     for bad in (b"", b"no zip", whole[: len(whole) // 2]):
         (tmp_path / FILE).write_bytes(bad)
@@ -244,6 +252,22 @@ def test_nothing_near_says_nothing():
     assert answer[10, 12] > 0.7 and answer[90, 108] < 0.3
     assert answer[25, 35] > 0.5  # far away, but in the feature's segment
     assert answer[50, 60] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_frames_vote_on_pixels_and_segments_without_features():
+    flow = np.zeros((2, 50, 60), np.uint8)
+    flow[1, :10, :20] = 4
+    flow[0, 25:] = 4
+    points = replace(NO_POINTS, flow=flow)
+    assert points.informative and not NO_POINTS.informative
+    labels = np.zeros((100, 120), np.int32)
+    labels[:20, :60] = 1  # its left two thirds move, by flow; nothing is known of the rest
+    answer = moving_map(points, labels, (100, 120))
+    assert answer[10, 20] > CERTAIN and answer[80, 60] < 0.2
+    assert MOVES < answer[10, 50] < CERTAIN
+    assert answer[40, 100] == pytest.approx(0.5)
+    photo = draw_points(np.full((100, 120, 3), 128, np.uint8), points)
+    assert photo[10, 20, 0] > photo[10, 20, 1] and photo[80, 60, 1] > photo[80, 60, 0]
 
 
 def test_what_stands_in_some_photos_and_is_gone_in_others_is_seen_through():

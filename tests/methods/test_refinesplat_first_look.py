@@ -44,11 +44,11 @@ def passers(shift: int = 9) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return photos, masks
 
 
-def looks(photos, config=None, cloud=None, moving=None):
+def looks(photos, config=None, cloud=None, moving=None, by_flow=False):
     cameras = [camera(view) for view in range(VIEWS)]
     surfaces = static_surfaces(cameras, points() if cloud is None else cloud)
     moves = None if moving is None else [np.full(surface.shape, moving, np.float32) for surface in surfaces]
-    return initial_mask_prior(cameras, photos, surfaces, config or JUDGE_ALL, moves)
+    return initial_mask_prior(cameras, photos, surfaces, config or JUDGE_ALL, moves, by_flow=by_flow)
 
 
 def keeps(photos, config=None, cloud=None):
@@ -191,6 +191,16 @@ def test_features_that_move_count_but_in_a_crowd():
     for photos, counts in ((passers()[0], True), (crowd()[0], False)):
         without, still = looks(photos), looks(photos, moving=0.45)
         assert any(not np.array_equal(a.passing, b.passing) for a, b in zip(without, still)) == counts
+
+
+def test_what_moves_by_flow_counts_in_a_crowd_and_stays_masked():
+    photos, _ = crowd()
+    without, still = looks(photos), looks(photos, moving=0.2, by_flow=True)
+    assert any(not np.array_equal(a.passing, b.passing) for a, b in zip(without, still))
+    assert still[0].moving((HEIGHT, WIDTH)) is None
+    certain = looks(photos, moving=0.9, by_flow=True)
+    assert certain[0].moving((HEIGHT, WIDTH)).all()
+    assert looks(photos, moving=0.9)[0].moving((HEIGHT, WIDTH)) is None  # features are not that sure
 
 
 def test_later_masks_cover_a_few_times_what_the_first_look_masks():

@@ -61,14 +61,14 @@ def pixel_evidence(photos, cameras, surfaces=(), **changes) -> PixelEvidence:
     )
 
 
-def masks_of(values, labels, config, ceiling=None, unseen=None) -> PhotoMasks:
+def masks_of(values, labels, config, ceiling=None, unseen=None, moving=None) -> PhotoMasks:
     """Of one photo whose evidence is `values`, judged alone."""
     count = int(labels.max())
     known = Labels([labels], [np.zeros(count, bool)], [None if unseen is None else ~unseen], "cpu")
     values, none = tensor(values), torch.full((1, known.most), torch.nan, dtype=torch.float64)
     ceiling = None if ceiling is None else number(ceiling)
     seen = None if unseen is None else tensor(~unseen)
-    return make_masks(0, Maps(values, values), known, (none, none), 0.5, config, ceiling, seen)
+    return make_masks(0, Maps(values, values), known, (none, none), 0.5, config, ceiling, seen, moving)
 
 
 def test_correlation_is_pearsons_over_each_box():
@@ -276,6 +276,15 @@ def test_a_surface_that_too_few_others_see_is_no_evidence():
         right = looked(pixels, 0, off, remember=False)[H // 2, W // 2]
         far = looked(pixels, 0, off, depth=3 * PLANE, remember=False)[H // 2, W // 2]
         assert right > 0.5 and far == pytest.approx(wrong * right)
+
+
+def test_what_moves_for_certain_is_masked_where_the_render_agrees():
+    labels, moving = np.ones((8, 8), np.int32), np.zeros((8, 8), bool)
+    moving[2:5, 2:5] = True
+    config = MaskConfig()
+    masked = masks_of(np.zeros((8, 8)), labels, config, moving=tensor(moving)).keep.numpy() < 0.5
+    np.testing.assert_array_equal(masked, moving)
+    assert not (masks_of(np.zeros((8, 8)), labels, config).keep < 0.5).any()
 
 
 def test_a_look_that_is_not_remembered_leaves_no_trace():

@@ -145,6 +145,9 @@ def explain(store: MaskStore, step: Step, x: int, y: int) -> list[str]:
     maskable, weight = store.maskable[view], store.factors[view]
     if maskable is not None and not bool(maskable[y, x]):
         return []
+    moving = store.moving[view]
+    if moving is not None and bool(moving[y, x]):
+        return []
     own = float(enlarge(maps.statistic, *shape)[y, x])
     what = "difference in structure, in units of what noise causes" if structure else config.statistic
     lines = [f"evidence of the pixel: {own:.2f} ({what})"]

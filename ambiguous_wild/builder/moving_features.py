@@ -22,7 +22,7 @@ from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.records import MotionResult
 from ambiguous_wild.builder.registration import INLIER_RATIO
 from ambiguous_wild.builder.relative_poses import MIN_INLIERS
-from ambiguous_wild.builder.residual_flow import flow_votes
+from ambiguous_wild.builder.residual_flow import UNFIT_PX, flow_votes
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ModelCamera
 from ambiguous_wild.io.images import read_gray
@@ -222,13 +222,17 @@ def write_motion(
     through = seen_through(colmap_model, number_of)
     points = motion_points(matched, matched.poses(colmap_model), train, pinholes, through)
     names = sorted((n for n in train if n in pinholes), key=natural_key)
+    unfit = []
     for name, flow in flow_votes(undistorted, lambda n: read_gray(photos / n), names, threads):
-        points[name] = dataclasses.replace(points.get(name, NO_POINTS), flow=flow)
+        points[name] = dataclasses.replace(points.get(name, NO_POINTS), flow=flow.votes)
+        if UNFIT_PX < flow.residual_px < np.inf:
+            unfit.append(name)
     write_motion_points(folder / FILE, points)
     return {
         "static": sum(int((~p.moves).sum()) for p in points.values()),
         "moving": sum(int(p.moves.sum()) for p in points.values()),
         "silent": sum(not p.informative for p in points.values()),
+        "unfit": unfit,
     }
 
 

@@ -193,6 +193,7 @@ class MotionResult(TypedDict):
     static: int
     moving: int  # they fit another motion than that of the static scene
     silent: int  # photos without such features
+    unfit: list[str]  # photos of a sequence whose optical flow does not fit their poses
 
 
 class MapResult(TypedDict):

@@ -32,6 +32,7 @@ FAR_PX = 20.0  # median flow of the camera's rotation from which flow starts the
 COMPARED = 5  # px of a map, side of the window in which two matches are compared
 LEAST_PX = 0.35  # least uncertainty of a match
 MOST_PX = 3.0  # typical residual above which the poses of a pair do not fit, and it has no votes
+UNFIT_PX = 1.0  # typical residual from which a photo's pose is named in a warning
 MOVES, STAYS = 4.0, 2.0  # residual in units of its uncertainty, from which or up to which a frame votes
 FITS = 4  # of the depth, each with weights from the residuals of the last
 # A pixel is behind the static surface if points surround it within this share of the longer side, and its
@@ -90,9 +91,18 @@ class Matches:
         return float((self.returns & self.inside).sum() / max(self.inside.sum(), 1))
 
 
+@dataclass(frozen=True)
+class FlowVotes:
+    """What a photo's neighbours in the sequence show of it."""
+
+    votes: np.ndarray  # [2, h, w] uint8, frames in which a pixel stays, and in which it moves
+    # robust deviation of the residual flow of its median neighbour; NaN without one, inf if nothing returns
+    residual_px: float
+
+
 def flow_votes(
     model: ColmapModel, read: Callable[[str], np.ndarray], names: Sequence[str], threads: int
-) -> Iterator[tuple[str, np.ndarray]]:
+) -> Iterator[tuple[str, FlowVotes]]:
     """Count for each pixel the neighbouring frames that show that it stays or moves.
 
     Args:
@@ -102,8 +112,7 @@ def flow_votes(
         threads: pairs at a time.
 
     Yields:
-        Name and [2, h, w] uint8: frames in which a pixel stays, frames in which it moves. Nothing if the
-        photos are no sequence.
+        Each name with its votes; nothing if the photos are no sequence.
     """
     images, count = {image.name: image for image in model.images.values()}, len(names)
     if count < FEWEST_FRAMES:
@@ -139,7 +148,7 @@ def flow_votes(
         if (complete := latest - REACH) >= 0:
             near = range(max(complete - POINTS_FROM, 0), min(complete + POINTS_FROM + 1, count))
             ids = np.unique(np.concatenate([images[names[n]].point_ids for n in near]))
-            xyz = model.points.xyz[np.searchsorted(model.points.ids, ids[ids >= 0])]
+            xyz = model.points.xyz[np.isin(model.points.ids, ids)]
             others = [(frame(n), m) for n, m in known.pop(complete).items() if m.returned >= FLOWS]
             yield names[complete], count_votes(frame(complete), others, xyz)
 
@@ -199,8 +208,8 @@ def _better(one: Matches, two: Matches) -> Matches:
 
 def count_votes(
     frame: SequenceFrame, others: Sequence[tuple[SequenceFrame, Matches]], xyz: np.ndarray
-) -> np.ndarray:
-    """Return the numbers of frames in which each pixel stays or moves, [2, h, w] uint8.
+) -> FlowVotes:
+    """Count the frames in which each pixel stays or moves.
 
     Args:
         frame: the frame of the map.
@@ -226,7 +235,8 @@ def count_votes(
     for n, residual in zip(neighbours, residuals):
         votes[0] += n.valid & (residual <= STAYS) & near
         votes[1] += n.valid & (residual >= MOVES) & np.isfinite(residual)
-    return votes
+    typical_px = [n.typical_px(inverse) for n in neighbours]
+    return FlowVotes(votes, float(np.median(typical_px)) if typical_px else np.nan)
 
 
 @dataclass(frozen=True)
@@ -244,13 +254,17 @@ class _Neighbour:
         ahead = self.away + inverse[..., None] * self.shift
         return np.asarray(ahead[..., :2] / np.maximum(ahead[..., 2:], 1e-6))
 
+    def typical_px(self, inverse: np.ndarray) -> float:
+        """Return the robust deviation of the residual flow: errors of poses and flow are alike in a pair."""
+        distance = np.linalg.norm(self.project(inverse) - self.xy, axis=2)
+        return 1.48 * float(np.median(distance[self.valid])) if self.valid.any() else np.inf
+
     def residual(self, inverse: np.ndarray) -> np.ndarray:
         """Return the residual flow [h, w] in units of its uncertainty; inf if the poses do not fit."""
-        distance = np.linalg.norm(self.project(inverse) - self.xy, axis=2)
-        # errors of poses and of flow are alike everywhere in a pair
-        typical = 1.48 * float(np.median(distance[self.valid])) if self.valid.any() else np.inf
+        typical = self.typical_px(inverse)
         if typical > MOST_PX:
-            return np.full(distance.shape, np.inf)
+            return np.full(inverse.shape, np.inf)
+        distance = np.linalg.norm(self.project(inverse) - self.xy, axis=2)
         return np.asarray(distance / np.maximum(self.unit_px, typical))
 
 

@@ -116,6 +116,7 @@ def scene_record(
             *_parallax_warnings(model),
             *part_lines(mapping["components"], sources, settings.part),
             *provisional_warnings([sources[name] for name in mapping["provisional"]]),
+            *_unfit_warnings([sources[name] for name in results.motion["unfit"]]),
             *mask_warnings(results.masks),
             *split.warnings,
             *map_warnings(results.map),
@@ -158,6 +159,15 @@ def point_checks(model: ColmapModel, test: set[str]) -> tuple[int, int]:
     owner = np.repeat(np.arange(len(lengths)), lengths)
     trained = np.bincount(owner, weights=in_train, minlength=len(lengths))
     return int(((trained == 0) & (lengths > 0)).sum()), int((lengths == 2).sum())
+
+
+def _unfit_warnings(photos: Sequence[str]) -> list[str]:
+    if not photos:
+        return []
+    return [
+        f"optical flow does not fit the poses of {counted(len(photos), 'photo')}: {shortlist(photos, 5)}; "
+        "what fills much of them may move with the camera: mask it (--keep-masks), or leave them out"
+    ]
 
 
 def parallax_deg(model: ColmapModel) -> float:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.residual_flow import flow_votes
+from ambiguous_wild.builder.residual_flow import UNFIT_PX, flow_votes
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage, points_without_tracks
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
@@ -76,7 +76,9 @@ def votes(
     """Share of the square and of the rest, for which most votes say that they [stay, move]."""
     photos, masks = frames(square)
     on, off = [], []
-    for name, counts in flow_votes(model(poses), photos.__getitem__, sorted(photos), threads):
+    for name, found in flow_votes(model(poses), photos.__getitem__, sorted(photos), threads):
+        counts = found.votes
+        assert found.residual_px < 0.5
         assert counts.dtype == np.uint8 and counts.shape[0] == 2 and counts.sum(0).max() <= 4
         inside = (
             cv2.resize(masks[name].astype(np.uint8), counts.shape[:0:-1], interpolation=cv2.INTER_AREA) > 0
@@ -122,7 +124,8 @@ def test_poses_that_do_not_fit_have_no_votes() -> None:
     for image in tilted.images.values():
         image.qvec[:] = [1.0, 0.05 * (image.image_id % 2), 0.0, 0.0]
     counts = dict(flow_votes(tilted, photos.__getitem__, sorted(photos), 1))
-    assert sum(int(c.sum()) for c in counts.values()) == 0
+    assert sum(int(c.votes.sum()) for c in counts.values()) == 0
+    assert min(c.residual_px for c in counts.values()) > UNFIT_PX
 
 
 def test_photos_that_do_not_follow_each_other_have_no_votes() -> None:
@@ -139,7 +142,7 @@ def test_threads_do_not_change_votes() -> None:
     one, three = (dict(flow_votes(model(), photos.__getitem__, sorted(photos), n)) for n in (1, 3))
     assert list(one) == list(three) == sorted(photos)
     for name in one:
-        np.testing.assert_array_equal(one[name], three[name])
+        np.testing.assert_array_equal(one[name].votes, three[name].votes)
 
 
 def test_a_camera_that_turns_quickly_still_knows_the_static_scene() -> None:
@@ -152,7 +155,7 @@ def test_a_camera_that_turns_quickly_still_knows_the_static_scene() -> None:
         x, y = 300 * (np.arctan2(u, FOCAL) + angle) + 512, 300 * v / np.hypot(u, FOCAL) + 512  # a cylinder
         pixels = cv2.remap(texture(1), x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
         photos[image.name] = np.clip(pixels * 220, 0, 255).astype(np.uint8)
-    counts = dict(flow_votes(tilted, photos.__getitem__, sorted(photos), 1))
+    counts = {k: f.votes for k, f in flow_votes(tilted, photos.__getitem__, sorted(photos), 1)}
     assert len(counts) == FRAMES
     assert max(np.mean(c[1] > c[0]) for c in counts.values()) < 0.01
     assert np.mean([c[0] > 0 for c in counts.values()]) > 0.6

@@ -1,9 +1,9 @@
 """What moves between neighbouring frames of a sequence: optical flow less the rigid flow of the static scene.
 
 Smooth cloth has no features, and cloth of the wall's colour differs from no render. Optical flow sees both
-where frames follow each other closely. The matches of a static pixel lie on its epipolar lines, at one depth,
-and not behind the surface that surrounds it. So one depth is fitted to all matches of a pixel; what is left
-is its residual flow, also for motion along the epipolar line.
+where frames follow each other closely. The matches of a static pixel lie on its epipolar lines, at one depth.
+So one depth is fitted to all matches of a pixel; what is left is its residual flow. Motion along the epipolar
+line may look like another depth; then nothing is said, because so does the view through a window.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ MOST_PX = 3.0  # typical residual above which the poses of a pair do not fit, an
 UNFIT_PX = 1.0  # typical residual from which a photo's pose is named in a warning
 MOVES, STAYS = 4.0, 2.0  # residual in units of its uncertainty, from which or up to which a frame votes
 FITS = 4  # of the depth, each with weights from the residuals of the last
-# A pixel is behind the static surface if points surround it within this share of the longer side, and its
-# inverse depth is less than this share of the least of theirs; it stays only if not above the greatest.
+# A pixel stays if points surround it within this share of the longer side, and an inverse depth explains its
+# match that is at least this share of the least of theirs and at most that of the greatest.
 AROUND, BEHIND, IN_FRONT = 0.12, 0.7, 1.3
 POINTS_FROM = 4  # frames before and after, whose points make that surface
 
@@ -228,12 +228,13 @@ def count_votes(
                 slope = n.xy[..., axis] * n.shift[2] - n.shift[axis]
                 above += n.valid / unit**2 * slope * (n.away[..., axis] - n.xy[..., axis] * n.away[..., 2])
                 below += n.valid / unit**2 * slope**2
-        inverse = np.maximum(above / below, BEHIND * least)
+        inverse = np.maximum(above / below, 0.0)
         residuals = [n.residual(inverse) for n in neighbours]
     # an imported model may have no points, and then nothing is known of depths
-    near = (inverse <= IN_FRONT * greatest) & (least > 0) if len(xyz) else np.ones(least.shape, bool)
+    known = (least > 0) | (len(xyz) == 0)
+    around = np.clip(inverse, BEHIND * least, IN_FRONT * greatest) if len(xyz) else inverse
     for n, residual in zip(neighbours, residuals):
-        votes[0] += n.valid & (residual <= STAYS) & near
+        votes[0] += n.valid & known & (n.residual(around) <= STAYS)
         votes[1] += n.valid & (residual >= MOVES) & np.isfinite(residual)
     typical_px = [n.typical_px(inverse) for n in neighbours]
     return FlowVotes(votes, float(np.median(typical_px)) if typical_px else np.nan)

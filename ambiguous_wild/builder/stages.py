@@ -153,17 +153,18 @@ class Stages:
                 bar=self.bar,
             ),
         )
-        reduced = factor > 1 and max(max(photo.size) for photo in photos) >= factor * FLOW_SIDE
+        large = max(max(photo.size) for photo in photos) >= factor * FLOW_SIDE
+        images = f"images_{factor}" if factor > 1 and large else "images"  # read for optical flow
         motion = work.run(
             "motion",
-            [flat.key, split.train],
+            [mapping.key, split.train, images],
             lambda f: write_motion(
                 f,
                 matches.folder / DATABASE,
                 mapping.folder / RELATIVE_POSES,
                 mapping.folder / "0",
                 flat.folder / "sparse" / "0",
-                flat.folder / (f"images_{factor}" if reduced else "images"),
+                flat.folder / images,
                 split.train,
                 self.jobs,
             ),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from ambiguous_wild.core.errors import AwError, counted, shortlist, similar_path
-from ambiguous_wild.io.files import sha256_file
+from ambiguous_wild.io.files import natural_key, sha256_file
 from ambiguous_wild.io.images import header_size
 from ambiguous_wild.io.mask_files import MASK_FOLDERS, masks_beside_photos
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES, UNREAD_SUFFIXES, is_photo
@@ -130,12 +129,6 @@ def _check_roots(given: Sequence[Path | str]) -> list[Path]:
             raise AwError(f"{raw} and {other} are or hold the same folder; give each once")
         roots.append(root)
     return roots
-
-
-def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sort key that puts IMG_2 before IMG_10."""
-    parts = re.split(r"(\d+)", name)
-    return [(1, int(p), p) if p.isascii() and p.isdigit() else (0, 0, p.casefold()) for p in parts]
 
 
 def _photo_folders(root: Path, masks: Path | None) -> list[tuple[Path, Side]]:

@@ -17,7 +17,6 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ambiguous_wild.builder.collect import natural_key
 from ambiguous_wild.builder.matched import Matched
 from ambiguous_wild.builder.records import MotionResult
 from ambiguous_wild.builder.registration import INLIER_RATIO
@@ -25,6 +24,7 @@ from ambiguous_wild.builder.relative_poses import MIN_INLIERS
 from ambiguous_wild.builder.residual_flow import UNFIT_PX, flow_votes
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ModelCamera
+from ambiguous_wild.io.files import natural_key
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.io.motion_points import FILE, NO_POINTS, MotionPoints, write_motion_points
 from ambiguous_wild.io.safe_pycolmap import pycolmap
@@ -204,7 +204,7 @@ def write_motion(
         flat: folder of the model of the undistorted photos.
         photos: folder of the undistorted photos, of any size.
         train: names of the train photos.
-        threads: photos at a time.
+        threads: pairs of photos at a time.
     """
     matched, colmap_model = Matched.read(database), pycolmap.Reconstruction(str(model))
     matched.take_cameras(colmap_model)
@@ -225,13 +225,14 @@ def write_motion(
     unfit = []
     for name, flow in flow_votes(undistorted, lambda n: read_gray(photos / n), names, threads):
         points[name] = dataclasses.replace(points.get(name, NO_POINTS), flow=flow.votes)
-        if UNFIT_PX < flow.residual_px < np.inf:
+        if flow.residual_px > UNFIT_PX:
             unfit.append(name)
     write_motion_points(folder / FILE, points)
     return {
         "static": sum(int((~p.moves).sum()) for p in points.values()),
         "moving": sum(int(p.moves.sum()) for p in points.values()),
         "silent": sum(not p.informative for p in points.values()),
+        "sequence": sum(p.flow is not None for p in points.values()),
         "unfit": unfit,
     }
 

@@ -188,11 +188,12 @@ class ResampleResult(TypedDict):
 
 
 class MotionResult(TypedDict):
-    """Result of the stage `motion`: numbers of features of the train photos."""
+    """Result of the stage `motion`: features of the train photos, and votes by optical flow."""
 
     static: int
     moving: int  # they fit another motion than that of the static scene
-    silent: int  # photos without such features
+    silent: int  # photos without any vote
+    sequence: int  # photos whose neighbours vote by optical flow; 0: the photos are no sequence
     unfit: list[str]  # photos of a sequence whose optical flow does not fit their poses
 
 
@@ -241,6 +242,7 @@ class SceneCounts(TypedDict):
     pairs_verified: int
     features_that_stay: int  # features of train photos that are static by other photos
     features_that_move: int  # features of train photos that fit another motion
+    photos_of_sequence: int  # train photos with votes by optical flow
 
 
 class ScenePhoto(TypedDict):

@@ -67,10 +67,10 @@ class SequenceFrame:
 
     def rotation_flow(self, other: SequenceFrame) -> np.ndarray:
         """Return the flow [H, W, 2] float32 that the rotation between two frames causes, of far points."""
-        turn = other.cam_from_world[:3, :3] @ self.cam_from_world[:3, :3].T
+        rotation = other.cam_from_world[:3, :3] @ self.cam_from_world[:3, :3].T
         h, w = self.grey.shape
         xy = np.dstack([*np.meshgrid(np.arange(w), np.arange(h)), np.ones((h, w))])
-        ahead = xy @ (other.intrinsics @ turn @ np.linalg.inv(self.intrinsics)).T
+        ahead = xy @ (other.intrinsics @ rotation @ np.linalg.inv(self.intrinsics)).T
         there = ahead[..., :2] / np.maximum(ahead[..., 2:], 1e-6)
         return np.clip(there - xy[..., :2], -SIDE, SIDE).astype(np.float32)
 
@@ -96,7 +96,8 @@ class FlowVotes:
     """What a photo's neighbours in the sequence show of it."""
 
     votes: np.ndarray  # [2, h, w] uint8, frames in which a pixel stays, and in which it moves
-    # robust deviation of the residual flow of its median neighbour; NaN without one, inf if nothing returns
+    # robust deviation of the residual flow of its median neighbour, the lower of two; NaN without one, inf if
+    # by their poses the two show nothing in common
     residual_px: float
 
 
@@ -150,7 +151,10 @@ def flow_votes(
             ids = np.unique(np.concatenate([images[names[n]].point_ids for n in near]))
             xyz = model.points.xyz[np.isin(model.points.ids, ids)]
             others = [(frame(n), m) for n, m in known.pop(complete).items() if m.returned >= FLOWS]
-            yield names[complete], count_votes(frame(complete), others, xyz)
+            yield (
+                names[complete],
+                count_votes(frame(complete), others, xyz if len(model.points.ids) else None),
+            )
 
 
 def _matches(first: SequenceFrame, second: SequenceFrame) -> tuple[Matches, Matches]:
@@ -160,9 +164,9 @@ def _matches(first: SequenceFrame, second: SequenceFrame) -> tuple[Matches, Matc
     second candidate: the first follows what moves with the camera, the second what is static.
     """
     there, back = _candidate(first, second, None, None)
-    turns = first.rotation_flow(second), second.rotation_flow(first)
-    if np.median(np.linalg.norm(turns[0], axis=2)) >= FAR_PX:
-        pairs = zip((there, back), _candidate(first, second, *turns))
+    rotations = first.rotation_flow(second), second.rotation_flow(first)
+    if np.median(np.linalg.norm(rotations[0], axis=2)) >= FAR_PX:
+        pairs = zip((there, back), _candidate(first, second, *rotations))
         there, back = (_better(*both) for both in pairs)
     return there, back
 
@@ -207,37 +211,37 @@ def _better(one: Matches, two: Matches) -> Matches:
 
 
 def count_votes(
-    frame: SequenceFrame, others: Sequence[tuple[SequenceFrame, Matches]], xyz: np.ndarray
+    frame: SequenceFrame, others: Sequence[tuple[SequenceFrame, Matches]], xyz: np.ndarray | None
 ) -> FlowVotes:
     """Count the frames in which each pixel stays or moves.
 
     Args:
         frame: the frame of the map.
         others: neighbours, with the map's matches in them.
-        xyz: [M, 3] points of the static scene that are visible around the frame.
+        xyz: [M, 3] points of the static scene that are visible around the frame; None: the model has none,
+            as imported ones may, and then nothing is known of depths.
     """
     votes = np.zeros((2, *frame.map_shape), np.uint8)
-    least, greatest = surrounding_inverse_depths(frame, xyz)
+    least, greatest = surrounding_inverse_depths(frame, np.zeros((0, 3)) if xyz is None else xyz)
     neighbours = [_neighbour(frame, other, matches, (least, greatest)) for other, matches in others]
     inverse, residuals = np.zeros(least.shape), [np.zeros(least.shape)] * len(others)
     for _ in range(FITS):
         above, below = np.zeros(least.shape), np.full(least.shape, 1e-12)
         for n, residual in zip(neighbours, residuals):
-            unit = n.unit_px * (1.0 + (residual / STAYS) ** 2) * (n.away[..., 2] + inverse * n.shift[2])
+            unit = n.sigma_px * (1.0 + (residual / STAYS) ** 2) * (n.away[..., 2] + inverse * n.shift[2])
             for axis in range(2):
                 slope = n.xy[..., axis] * n.shift[2] - n.shift[axis]
                 above += n.valid / unit**2 * slope * (n.away[..., axis] - n.xy[..., axis] * n.away[..., 2])
                 below += n.valid / unit**2 * slope**2
         inverse = np.maximum(above / below, 0.0)
         residuals = [n.residual(inverse) for n in neighbours]
-    # an imported model may have no points, and then nothing is known of depths
-    known = (least > 0) | (len(xyz) == 0)
-    around = np.clip(inverse, BEHIND * least, IN_FRONT * greatest) if len(xyz) else inverse
+    around = inverse if xyz is None else np.clip(inverse, BEHIND * least, IN_FRONT * greatest)
     for n, residual in zip(neighbours, residuals):
-        votes[0] += n.valid & known & (n.residual(around) <= STAYS)
+        votes[0] += n.valid & ((least > 0) | (xyz is None)) & (n.residual(around) <= STAYS)
         votes[1] += n.valid & (residual >= MOVES) & np.isfinite(residual)
     typical_px = [n.typical_px(inverse) for n in neighbours]
-    return FlowVotes(votes, float(np.median(typical_px)) if typical_px else np.nan)
+    median_px = float(np.quantile(typical_px, 0.5, method="lower")) if typical_px else np.nan
+    return FlowVotes(votes, median_px)
 
 
 @dataclass(frozen=True)
@@ -247,7 +251,7 @@ class _Neighbour:
     away: np.ndarray  # [h, w, 3]
     shift: np.ndarray  # [3]
     xy: np.ndarray  # [h, w, 2] px, the matches
-    unit_px: np.ndarray  # [h, w], uncertainty of the matches
+    sigma_px: np.ndarray  # [h, w], uncertainty of the matches
     valid: np.ndarray  # [h, w] bool: the match returns, and the frame shows the static surface, too
 
     def project(self, inverse: np.ndarray) -> np.ndarray:
@@ -266,7 +270,7 @@ class _Neighbour:
         if typical > MOST_PX:
             return np.full(inverse.shape, np.inf)
         distance = np.linalg.norm(self.project(inverse) - self.xy, axis=2)
-        return np.asarray(distance / np.maximum(self.unit_px, typical))
+        return np.asarray(distance / np.maximum(self.sigma_px, typical))
 
 
 def _neighbour(

@@ -104,6 +104,7 @@ def scene_record(
             "pairs_verified": matches["verified"],
             "features_that_stay": results.motion["static"],
             "features_that_move": results.motion["moving"],
+            "photos_of_sequence": results.motion["sequence"],
         },
         "reprojection_error_px": summary["error_px"],
         "mean_track_length": summary["track_length"],
@@ -116,7 +117,7 @@ def scene_record(
             *_parallax_warnings(model),
             *part_lines(mapping["components"], sources, settings.part),
             *provisional_warnings([sources[name] for name in mapping["provisional"]]),
-            *_unfit_warnings([sources[name] for name in results.motion["unfit"]]),
+            *unfit_warnings([sources[name] for name in results.motion["unfit"]]),
             *mask_warnings(results.masks),
             *split.warnings,
             *map_warnings(results.map),
@@ -161,7 +162,8 @@ def point_checks(model: ColmapModel, test: set[str]) -> tuple[int, int]:
     return int(((trained == 0) & (lengths > 0)).sum()), int((lengths == 2).sum())
 
 
-def _unfit_warnings(photos: Sequence[str]) -> list[str]:
+def unfit_warnings(photos: Sequence[str]) -> list[str]:
+    """Return a warning on photos whose neighbours' optical flow does not fit their poses."""
     if not photos:
         return []
     return [

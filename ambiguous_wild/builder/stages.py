@@ -205,13 +205,13 @@ class Stages:
             drawn.folder / MAP,
             [n for n in split.test if masks and n.removesuffix(".png") in masks.facts["kept_share"]],
         )
-        return self._package(work, flat.key, parts, record)
+        return self._package(work, [flat.key, motion.key], parts, record)
 
-    def _package(self, work: Workspace, flat_key: str, parts: SceneParts, record: KeyedRecord) -> Path:
+    def _package(self, work: Workspace, keys: list[str], parts: SceneParts, record: KeyedRecord) -> Path:
         def run() -> StageResult[PackageResult]:
             return work.run(
                 "package",
-                [self.inputs, flat_key],
+                [self.inputs, *keys],
                 lambda f: package(f / "scene", parts, record, link=self.link, jobs=self.jobs),
             )
 

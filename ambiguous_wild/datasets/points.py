@@ -150,7 +150,7 @@ def find_motion(
         bar: progress.
 
         Returns:
-            Numbers of static and moving features.
+            Numbers of static and moving features, and photos whose poses optical flow does not fit.
 
     Raises:
         AwError: the poses do not fit the photos' own matches.

@@ -17,7 +17,7 @@ from ambiguous_wild.builder.keep_masks import mask_warnings
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.resample import check_factor
 from ambiguous_wild.builder.scene_package import list_files, nerfbaselines_info
-from ambiguous_wild.builder.scene_record import point_checks
+from ambiguous_wild.builder.scene_record import point_checks, unfit_warnings
 from ambiguous_wild.builder.workspace import content_key, versions
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.machine import photo_threads
@@ -264,6 +264,7 @@ def _write_scene(
         train = sorted(n for n, s in sides.items() if s == "train")
         motion = find_motion(folder, work / "motion", train, seed=settings.seed, jobs=jobs, bar=bar)
         notes.append(f"{motion['static']} features of train photos are static, {motion['moving']} move")
+        notes += unfit_warnings(motion["unfit"])
     for side in SIDES:
         lines = sorted(n for n, s in sides.items() if s == side)
         write_text(folder / f"{side}_list.txt", "".join(f"{n}\n" for n in lines))

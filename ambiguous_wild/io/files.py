@@ -472,3 +472,9 @@ def write_text(path: Path | str, text: str) -> None:
 def write_json(path: Path | str, data: Any) -> None:
     """Write JSON atomically: two-space indent, key order as given, NaN refused."""
     write_text(path, json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key that puts IMG_2 before IMG_10."""
+    parts = re.split(r"(\d+)", name)
+    return [(1, int(p), p) if p.isascii() and p.isdigit() else (0, 0, p.casefold()) for p in parts]

@@ -19,7 +19,7 @@ from ambiguous_wild.io.files import atomic_path
 
 FILE = "motion.npz"  # in the scene's folder
 _COLUMNS = {"xy": ("f4", (2,)), "static": ("u1", ()), "moving": ("u1", ()), "motion": ("i2", ())}
-_MAX_BYTES = 1 << 28  # largest unpacked size; a thousand photos have about 2e7, of a sequence 6e7
+_MAX_BYTES = 1 << 30  # largest unpacked size; a thousand photos have about 2e7, of a sequence 6e7
 # Exceptions that numpy and zipfile raise for a damaged file, besides their own.
 _DAMAGE = (ValueError, LookupError, OSError, EOFError, TypeError, AttributeError, RuntimeError, MemoryError,
            OverflowError)  # fmt: skip
@@ -27,7 +27,7 @@ _DAMAGE = (ValueError, LookupError, OSError, EOFError, TypeError, AttributeError
 
 @dataclass(frozen=True)
 class MotionPoints:
-    """Features of one photo that other train photos show too."""
+    """Features of one photo that other train photos show too, and votes on its pixels."""
 
     xy: np.ndarray  # [N, 2] float32, share of the photo's width and height
     static: np.ndarray  # [N] uint8, photos in which it lies where the static scene puts it
@@ -106,7 +106,8 @@ def _read(file: Mapping[str, np.ndarray]) -> dict[str, MotionPoints]:
 def _read_flows(file: Mapping[str, np.ndarray], count: int) -> list[np.ndarray | None]:
     """Read the votes [2, h, w] of each photo; None where it has none."""
     shapes, flow = file["flow_shapes"], file["flow"]
-    fit = shapes.dtype == np.int64 and shapes.shape == (count, 2) and shapes.min(initial=0) >= 0
+    fit = shapes.dtype == np.int64 and shapes.shape == (count, 2)
+    fit = fit and shapes.min(initial=0) >= 0 and shapes.max(initial=0) <= 1 << 15
     if not fit or flow.dtype != np.uint8 or flow.shape != (2 * int(shapes.prod(axis=1).sum()),):
         raise ValueError("its arrays do not fit together")
     parts = np.split(flow, np.cumsum(2 * shapes.prod(axis=1))[:-1])

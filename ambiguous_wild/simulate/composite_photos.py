@@ -22,8 +22,8 @@ from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.config import Facts, to_plain
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.srgb import srgb_to_linear
-from ambiguous_wild.io.files import atomic_dir, sha256_file, write_json
-from ambiguous_wild.io.images import write_png
+from ambiguous_wild.io.files import atomic_dir, natural_key, sha256_file, write_json
+from ambiguous_wild.io.images import header_size, write_png
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES, Exif, UnreadablePhoto, read_photo
 from ambiguous_wild.io.progress_bar import Progress
 from ambiguous_wild.simulate.composite_scene import check_request
@@ -100,6 +100,8 @@ def composite_photos(
         )
     shapes = [] if cutouts is None else read_cutouts(cutouts)
     paths, base = _list_photos(root), _base(root)
+    if config.path:
+        paths.sort(key=lambda path: natural_key(path.relative_to(base).as_posix()))
     is_test = [i % _TEST_EVERY == _TEST_EVERY // 2 for i in range(len(paths))]
     train = [path for path, test in zip(paths, is_test, strict=True) if not test]
     choice_seed, *seeds = np.random.SeedSequence(config.seed).spawn(1 + len(paths))
@@ -329,14 +331,19 @@ def _tracks(
 
     Args:
         shapes: cut-outs; none: rounded shapes.
-        paths: photos of the sequence; the first one's size stands for all.
+        paths: photos of the sequence.
         train: numbers of the train photos.
         config: coverage, presence, patches.
         rng: source of randomness.
 
     Raises:
-        AwError: even the largest pieces cover less.
+        AwError: even the largest pieces cover less, or the photos are of several sizes.
     """
+    sizes = {header_size(path): path.name for path in paths}
+    if len(sizes) > 1:
+        raise AwError(
+            f"--path needs photos of one size: {shortlist(sizes.values())} differ; crop or leave out"
+        )
     size = _read(paths[train[0]])[0].shape
     area = config.coverage / config.presence * size[0] * size[1]
     tracks: list[_Track] = []
@@ -359,8 +366,9 @@ def _tracks(
 
     def share(scale: float) -> float:
         shares = []
+        scaled = _scaled(small, scale, size)
         for number in train:
-            now, middles, heights = _under_way(_scaled(small, scale, size), number, size)
+            now, middles, heights = _under_way(scaled, number, size)
             shown, placements = [small[k].piece[0] for k in now], _placements(middles, size)
             shares.append(covered(shown, heights, placements, preview))
         return float(np.mean(shares))

@@ -50,6 +50,7 @@ _MOST_REMOVED = 0.5  # larger shares of a photo are no distractor, but a mask go
 # Least number in a masked region, above that of static ones: a distractor in each of 35 photos has 40 to 97,
 # regions of static captures have none.
 _MOVING_FEATURES = 3
+_PIXELS_A_FEATURE = 25  # of a map of optical flow, that count as much as a feature
 _NEAR = 0.01  # nearest depth, as in training
 _MARGIN = 0.15  # share of the picture beyond each side that is still counted
 
@@ -280,7 +281,8 @@ def _surest_region(masked: np.ndarray, points: MotionPoints | None) -> tuple[flo
     """Find the masked region [H, W] bool with the strongest evidence that it moves.
 
     Returns:
-        its features that move minus those that are static; without `points`, its share of the photo.
+        its features, and areas by optical flow, that move minus those that are static; without `points`, its
+        share of the photo.
         x and y of the middle of its upper edge, as shares of the photo.
     """
     import cv2
@@ -290,7 +292,12 @@ def _surest_region(masked: np.ndarray, points: MotionPoints | None) -> tuple[flo
     if points is not None:
         column, row = (points.xy * masked.shape[::-1]).astype(int).T
         inside = labels[np.minimum(row, masked.shape[0] - 1), np.minimum(column, masked.shape[1] - 1)]
-        evidence = np.bincount(inside, np.where(points.moves, 1.0, -1.0), minlength=len(stats))
+        evidence = np.bincount(inside, np.where(points.moves, 1.0, -1.0), minlength=len(stats)).astype(float)
+        if points.flow is not None:
+            stays, moves = points.flow.astype(np.float64)
+            at = cv2.resize(labels, moves.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            excess = np.sign(moves - stays) / _PIXELS_A_FEATURE
+            evidence += np.bincount(at.ravel(), excess.ravel(), minlength=len(stats))
     surest = 1 + int(np.argmax(evidence[1:]))
     left, top, width = stats[surest, :3].tolist()
     return float(evidence[surest]), [(left + width / 2) / masked.shape[1], top / masked.shape[0]]

@@ -23,7 +23,8 @@ from ambiguous_wild.vision.sam import SamInstances
 from ambiguous_wild.vision.sparse_surface import PIXELS
 
 MOVES = 0.6  # a pixel moves if `moving_map` is above this
-CERTAIN = 0.8  # and certainly by optical flow, if above this
+CERTAIN = 0.8  # and certainly, if above this and by optical flow
+_SPECK = np.ones((3, 3), np.uint8)  # smaller areas are not certain
 POINTS = "green stays, red moves"  # caption of `draw_points`
 # Reach of a feature: standard deviation in px on a map of `PIXELS`. Static features reach less far, because
 # what hides them may move.
@@ -35,10 +36,10 @@ UNSURE = 1.0  # votes that are added, half to each side: they pull the map towar
 
 
 def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Map [h, w] float32 in [0, 1] of what moves: 1 = moves, 0 = stays, 0.5 where no feature is near.
+    """Map [h, w] float32 in [0, 1] of what moves: 1 = moves, 0 = stays, 0.5 where nothing tells.
 
     Args:
-        points: the photo's features.
+        points: the photo's features, and votes by optical flow.
         labels: [H, W] int32 segments of the photo, 0 = none.
         shape: (h, w) of the map.
     """
@@ -66,6 +67,17 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
     excess = np.maximum(of_segment[0] - of_segment[1], 0.0) / np.maximum(of_segment[0] + of_segment[1], 1.0)
     moving, static = near[0] + np.float32(SEGMENT_VOTES) * excess[segments], near[1]
     return np.asarray((moving + UNSURE / 2) / (moving + static + UNSURE), np.float32)
+
+
+def certainly_moving(points: MotionPoints, moving: np.ndarray) -> np.ndarray | None:
+    """Return the pixels of a `moving_map` that optical flow is certain of, [h, w] bool; None if it has no vote."""
+    if points.flow is None or not points.flow.any():
+        return None
+    stays, moves = (
+        cv2.resize(votes, moving.shape[::-1], interpolation=cv2.INTER_NEAREST) for votes in points.flow
+    )
+    certain = (moving > CERTAIN) & (moves > stays)
+    return cv2.morphologyEx(certain.astype(np.uint8), cv2.MORPH_OPEN, _SPECK) > 0
 
 
 def moving_labels(

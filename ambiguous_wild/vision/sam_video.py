@@ -7,7 +7,6 @@ a stopped stage resumes. An object that is out of view for a whole chunk returns
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,6 +20,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.io.files import natural_key
 from ambiguous_wild.io.progress_bar import Progress
 from ambiguous_wild.vision.mask_ops import add_new
 from ambiguous_wild.vision.precompute import cache_key, cached, photo_labels
@@ -94,7 +94,7 @@ class SamVideoInstances:
             folder: the cache; each photo's instances and each chunk are one entry.
             progress: wraps the chunks, for a progress bar.
         """
-        order = sorted(range(len(photos)), key=lambda i: (natural(names[i]), i))
+        order = sorted(range(len(photos)), key=lambda i: (natural_key(names[i]), i))
         result: list[np.ndarray] = [np.zeros(tuple(p.shape[:2]), dtype=np.int32) for p in photos]
         carried: np.ndarray | None = None  # ids in the next chunk's first photo
         next_id = 1
@@ -171,9 +171,3 @@ def _painted(out: Any, size: tuple[int, int]) -> np.ndarray:
         best = torch.where(wins, full, best)
         ids[wins] = int(number)
     return ids.cpu().numpy()
-
-
-def natural(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key that orders numbers inside names by value: frame2 before frame10."""
-    parts = re.split(r"(\d+)", name)
-    return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)

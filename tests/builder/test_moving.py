@@ -32,7 +32,14 @@ from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.vision.motion_maps import CERTAIN, MOVES, draw_points, moving_labels, moving_map
+from ambiguous_wild.vision.motion_maps import (
+    CERTAIN,
+    MOVES,
+    certainly_moving,
+    draw_points,
+    moving_labels,
+    moving_map,
+)
 from ambiguous_wild.vision.sam import SamInstances
 from tests.builder import capture_maker
 from tests.builder.capture_maker import HEIGHT, WIDTH, eyes, render
@@ -266,6 +273,13 @@ def test_frames_vote_on_pixels_and_segments_without_features():
     assert answer[10, 20] > CERTAIN and answer[80, 60] < 0.2
     assert MOVES < answer[10, 50] < CERTAIN
     assert answer[40, 100] == pytest.approx(0.5)
+    certain = certainly_moving(points, answer)
+    assert certain[10, 20] and not certain[10, 50] and not certain[80, 60]
+    features = replace(two_points(), moving=np.array([3, 0], np.uint8))
+    alone = moving_map(features, labels, (100, 120))
+    assert alone.max() > CERTAIN and certainly_moving(features, alone) is None
+    silent = replace(features, flow=0 * flow)
+    assert certainly_moving(silent, moving_map(silent, labels, (100, 120))) is None
     photo = draw_points(np.full((100, 120, 3), 128, np.uint8), points)
     assert photo[10, 20, 0] > photo[10, 20, 1] and photo[80, 60, 1] > photo[80, 60, 0]
 

@@ -44,11 +44,12 @@ def passers(shift: int = 9) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return photos, masks
 
 
-def looks(photos, config=None, cloud=None, moving=None, by_flow=False):
+def looks(photos, config=None, cloud=None, moving=None, certain=None):
     cameras = [camera(view) for view in range(VIEWS)]
     surfaces = static_surfaces(cameras, points() if cloud is None else cloud)
     moves = None if moving is None else [np.full(surface.shape, moving, np.float32) for surface in surfaces]
-    return initial_mask_prior(cameras, photos, surfaces, config or JUDGE_ALL, moves, by_flow=by_flow)
+    sure = None if certain is None else [np.full(s.shape, certain) for s in surfaces]
+    return initial_mask_prior(cameras, photos, surfaces, config or JUDGE_ALL, moves, sure)
 
 
 def keeps(photos, config=None, cloud=None):
@@ -193,14 +194,22 @@ def test_features_that_move_count_but_in_a_crowd():
         assert any(not np.array_equal(a.passing, b.passing) for a, b in zip(without, still)) == counts
 
 
-def test_what_moves_by_flow_counts_in_a_crowd_and_stays_masked():
+def test_what_moves_by_flow_counts_in_a_crowd_and_is_masked_from_the_start():
     photos, _ = crowd()
-    without, still = looks(photos), looks(photos, moving=0.2, by_flow=True)
+    without, still = looks(photos), looks(photos, moving=0.2, certain=False)
     assert any(not np.array_equal(a.passing, b.passing) for a, b in zip(without, still))
     assert still[0].moving((HEIGHT, WIDTH)) is None
-    certain = looks(photos, moving=0.9, by_flow=True)
-    assert certain[0].moving((HEIGHT, WIDTH)).all()
     assert looks(photos, moving=0.9)[0].moving((HEIGHT, WIDTH)) is None  # features are not that sure
+    few = dataclasses.replace(JUDGE_ALL, least=0.9)  # whatever small share the rest masks
+    surfaces = static_surfaces([camera(0)], points())
+    corner = np.zeros(surfaces[0].shape, bool)
+    corner[:20, :20] = True
+    look = initial_mask_prior(
+        [camera(0)], [wall(0)], surfaces, few, [np.full(corner.shape, 0.4, np.float32)], [corner]
+    )[0]
+    keep, moving = look.keep((HEIGHT, WIDTH)), look.moving((HEIGHT, WIDTH))
+    np.testing.assert_array_equal(keep, ~moving)
+    assert 0 < moving.mean() < 0.5
 
 
 def test_later_masks_cover_a_few_times_what_the_first_look_masks():

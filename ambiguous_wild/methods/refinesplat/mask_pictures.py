@@ -98,9 +98,6 @@ def reasons(store: MaskStore, view: int, maps: Maps, masks: PhotoMasks) -> MaskR
     else:
         add(masked & masks.global_, "masked: it stands out from the rest of the photo")
     add(masked & (judged > threshold), f"masked: {differs} ({value})")
-    moving = store.moving[view]
-    if moving is not None:
-        add(masked & moving, "masked: it moves between neighbouring frames")
     static, seen = store.labels.static.get(view), store.pixels.seen[view]
     if static is not None:
         add(static & ~masked, "kept: structure from motion shows that its region does not move")
@@ -110,6 +107,9 @@ def reasons(store: MaskStore, view: int, maps: Maps, masks: PhotoMasks) -> MaskR
         add(~maskable, f"kept: {found}")
     if structure and seen is not None:
         add(~seen, "kept: too few other photos see this surface")
+    moving = store.moving[view]
+    if moving is not None:
+        add(masked & moving, "masked: it moves between neighbouring photos")
     regions = (labels.long().clamp(min=0) * len(sentences) + kinds).cpu().numpy()
     values = judged.double().nan_to_num().cpu().numpy().ravel()
     areas = np.bincount(regions.ravel())
@@ -138,15 +138,15 @@ def explain(store: MaskStore, step: Step, x: int, y: int) -> list[str]:
     """Return what was measured at a pixel of the photo; empty where nothing measured decided."""
     maps, masks = store.examine(step)
     view, config = step.view, store.limited.get(step.view, store.config.mask)
+    moving = store.moving[view]
+    if moving is not None and bool(moving[y, x]):
+        return []
     shape = store.labels.shapes[view]
     structure, seen = config.statistic == "structure", store.pixels.seen[view]
     if structure and seen is not None and not bool(seen[y, x]):
         return []
     maskable, weight = store.maskable[view], store.factors[view]
     if maskable is not None and not bool(maskable[y, x]):
-        return []
-    moving = store.moving[view]
-    if moving is not None and bool(moving[y, x]):
         return []
     own = float(enlarge(maps.statistic, *shape)[y, x])
     what = "difference in structure, in units of what noise causes" if structure else config.statistic

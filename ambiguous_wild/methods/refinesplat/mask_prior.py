@@ -31,7 +31,6 @@ from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.io.images import ximgproc
 from ambiguous_wild.methods.refinesplat.maps import Ranks, common_offset
 from ambiguous_wild.methods.refinesplat.multiview import nearest_views
-from ambiguous_wild.vision.motion_maps import CERTAIN
 from ambiguous_wild.vision.sparse_surface import BEHIND, PIXELS, in_map, world_points
 
 _SETTLED = 0.005  # a round in which a smaller share of pixels changes is the last
@@ -100,7 +99,8 @@ class InitialMaskPrior:
         """Return the pixels that are kept at first, [H, W] bool; None if all are."""
         passing = self.passing > 0.5
         if passing.mean() < self.least:
-            return None
+            moving = self.moving(shape)
+            return None if moving is None else ~moving
         return _resized(passing.astype(np.float32), shape) < 0.5
 
     def moving(self, shape: tuple[int, int]) -> np.ndarray | None:
@@ -120,8 +120,7 @@ def initial_mask_prior(
     surfaces: Sequence[np.ndarray | None],
     config: FirstLookConfig,
     moving: Sequence[np.ndarray | None] | None = None,
-    *,
-    by_flow: bool = False,
+    certain: Sequence[np.ndarray | None] | None = None,
 ) -> list[InitialMaskPrior | None]:
     """Return the first look at every photo; None for one without sparse points or comparable views.
 
@@ -131,7 +130,7 @@ def initial_mask_prior(
         surfaces: inverse depths [h, w] of the sparse points (`static_surfaces`).
         config: thresholds.
         moving: what moves in each photo (`moving_map`), in the shape of its surface; None: unknown.
-        by_flow: whether optical flow tells that for every pixel, not features alone.
+        certain: what moves for certain by optical flow (`certainly_moving`), [h, w] bool; None: no flow.
     """
     small = [
         None if inverse is None else _small(photo, inverse.shape)
@@ -141,6 +140,7 @@ def initial_mask_prior(
     near = nearest_views(cameras, 2 * config.views)
 
     moves = list(moving) if moving is not None else [None] * len(small)
+    surely = list(certain) if certain is not None else [None] * len(small)
 
     def answer(
         view: int, views: int, before: Sequence[np.ndarray | None], masked: Sequence[np.ndarray | None]
@@ -173,29 +173,21 @@ def initial_mask_prior(
     views = config.views
     if masked_share(answers) >= config.crowd:
         views = 2 * views
-        if not by_flow:
-            # features of a crowd are too few: renders get worse by 0.3 to 0.8 dB
-            moves = nothing
-            answers = [answer(view, config.views, nothing, nothing) for view in everything]
+        # features of a crowd are too few: renders get worse by 0.3 to 0.8 dB
+        moves = [None if by_flow is None else m for m, by_flow in zip(moves, surely)]
+        answers = [answer(view, config.views, nothing, moves) for view in everything]
     for _ in range(config.rounds):
         before, answers = answers, [answer(view, views, answers, answers) for view in everything]
         if _changed(before, answers) < _SETTLED:
             break
     crowd = masked_share(answers) >= config.crowd
     weight = config.crowd_weight if crowd else config.weight
-    certain = [None if m is None or not by_flow else _without_specks(m > CERTAIN) for m in moves]
     return [
         None
         if passing is None
-        else InitialMaskPrior(
-            passing, config.least, weight, _most(passing, inverse, config), crowd, moves_for_certain
-        )
-        for passing, inverse, moves_for_certain in zip(answers, surfaces, certain, strict=True)
+        else InitialMaskPrior(passing, config.least, weight, _most(passing, inverse, config), crowd, sure)
+        for passing, inverse, sure in zip(answers, surfaces, surely, strict=True)
     ]
-
-
-def _without_specks(moves: np.ndarray) -> np.ndarray:
-    return cv2.morphologyEx(moves.astype(np.uint8), cv2.MORPH_OPEN, _WINDOW) > 0
 
 
 def _most(answer: np.ndarray, inverse: np.ndarray | None, config: FirstLookConfig) -> float:

@@ -36,7 +36,7 @@ from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.method_hooks import MethodHooks, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import make_features, make_instances
-from ambiguous_wild.vision.motion_maps import moving_labels, moving_map
+from ambiguous_wild.vision.motion_maps import certainly_moving, moving_labels, moving_map
 from ambiguous_wild.vision.protocols import Instances
 from ambiguous_wild.vision.segments import GraphSegments
 from ambiguous_wild.vision.sparse_surface import static_surfaces
@@ -137,12 +137,9 @@ class RefineSplatMask(PausingMask):
             _ = self.inputs.semantics  # computed now, as a cost of the method before its first step
         surfaces = static_surfaces(data.cameras, data.scene.points.sure_xyz)
         if config.first_look.on:
-            moving = self._moving(surfaces) if config.first_look.motion > 0 else None
+            moving, certain = self._moving(surfaces) if config.first_look.motion > 0 else (None, None)
             photos = (photo.cpu().numpy() for photo in data.photos)  # one at a time: all may not fit
-            by_flow = any(points.flow is not None for points in self.points.values())
-            looks = initial_mask_prior(
-                data.cameras, photos, surfaces, config.first_look, moving, by_flow=by_flow
-            )
+            looks = initial_mask_prior(data.cameras, photos, surfaces, config.first_look, moving, certain)
             self.looks = {view: look for view, look in enumerate(looks) if look is not None}
         labels, static = self.inputs.labels, self.inputs.static
         self.masks = MaskStore(config, data, surfaces, self.looks, labels, static, self.compare)
@@ -153,18 +150,22 @@ class RefineSplatMask(PausingMask):
         look, camera = self.looks.get(view), self.data.cameras[view]
         return None if look is None else look.keep((camera.height, camera.width))
 
-    def _moving(self, surfaces: list[np.ndarray | None]) -> list[np.ndarray | None]:
-        """Return what moves in each photo, in the shape of its surface; None if unknown."""
+    def _moving(
+        self, surfaces: list[np.ndarray | None]
+    ) -> tuple[list[np.ndarray | None], list[np.ndarray | None]]:
+        """Return what moves in each photo, and for certain, in the shape of its surface; None if unknown."""
         points = self.points = read_motion_points(self.data.scene.root)
         data = self.data
         by_photo: list[np.ndarray | None] = [None] * len(surfaces)
+        certain: list[np.ndarray | None] = [None] * len(surfaces)
         for k, (view, surface) in enumerate(zip(data.scene.train, surfaces, strict=True)):
             of_photo, photo, labels = points.get(view.name), data.photos[k], self.inputs.labels[k]
             if of_photo is not None and surface is not None:
                 labels = labels.astype(np.int32)
                 labels = moving_labels(self.instances, photo, labels, of_photo, data.cache_dir)
-                by_photo[k] = moving_map(of_photo, labels, surface.shape)
-        return by_photo
+                moving = by_photo[k] = moving_map(of_photo, labels, surface.shape)
+                certain[k] = certainly_moving(of_photo, moving)
+        return by_photo, certain
 
     def keep(self, step: Step) -> Tensor | None:
         if not self.begun(step):

@@ -140,6 +140,7 @@ def flow_votes(
     neighbours = in_order(pair, [(k, k + 1) for k in probed], threads)
     if np.median([there.returned for there, _ in neighbours]) < SEQUENCE:
         return
+    tracked = any((image.point_ids >= 0).any() for image in images.values())
     known: dict[int, dict[int, Matches]] = {k: {} for k in range(count)}
     pairs = [(a, b) for b in range(count) for a in range(max(b - REACH, 0), b)]
     found = in_order(pair, pairs, threads)
@@ -153,7 +154,7 @@ def flow_votes(
             others = [(frame(n), m) for n, m in known.pop(complete).items() if m.returned >= FLOWS]
             yield (
                 names[complete],
-                count_votes(frame(complete), others, xyz if len(model.points.ids) else None),
+                count_votes(frame(complete), others, xyz if tracked else None),
             )
 
 
@@ -218,8 +219,8 @@ def count_votes(
     Args:
         frame: the frame of the map.
         others: neighbours, with the map's matches in them.
-        xyz: [M, 3] points of the static scene that are visible around the frame; None: the model has none,
-            as imported ones may, and then nothing is known of depths.
+        xyz: [M, 3] points of the static scene that are visible around the frame; None: the model has no
+            tracks, as imported ones may, and then nothing is known of depths.
     """
     votes = np.zeros((2, *frame.map_shape), np.uint8)
     least, greatest = surrounding_inverse_depths(frame, np.zeros((0, 3)) if xyz is None else xyz)

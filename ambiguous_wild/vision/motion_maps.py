@@ -70,7 +70,7 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
 
 
 def certainly_moving(points: MotionPoints, moving: np.ndarray) -> np.ndarray | None:
-    """Return the pixels [h, w] bool of a `moving_map` that optical flow is certain of; None without its votes."""
+    """Return the pixels [h, w] bool of a `moving_map` that flow is certain of; None without its votes."""
     if points.flow is None or not points.flow.any():
         return None
     stays, moves = (

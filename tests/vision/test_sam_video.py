@@ -3,8 +3,9 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.io.files import natural_key
 from ambiguous_wild.vision.sam import SamConfig
-from ambiguous_wild.vision.sam_video import SamVideoConfig, SamVideoInstances, natural
+from ambiguous_wild.vision.sam_video import SamVideoConfig, SamVideoInstances
 
 ALL = SamConfig(grid=3, least_iou=-9.0, least_stability=0.0)
 
@@ -69,7 +70,7 @@ def test_the_order_is_that_of_the_names(checkpoint):
         [photos[i] for i in shuffled], [names[i] for i in shuffled]
     )
     assert all(np.array_equal(found[k], expected[i]) for k, i in enumerate(shuffled))
-    assert sorted(["a10", "a9", "b1", "a", "3"], key=natural) == ["3", "a", "a9", "a10", "b1"]
+    assert sorted(["a10", "a9", "b1", "a", "3"], key=natural_key) == ["3", "a", "a9", "a10", "b1"]
 
 
 def test_a_stopped_stage_goes_on_where_it_was(checkpoint, tmp_path):

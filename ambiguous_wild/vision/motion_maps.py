@@ -55,16 +55,22 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
         np.add.at(at_feature, (row, column), weight)
         near.append(cv2.GaussianBlur(at_feature, (0, 0), reach) * np.float32(2.0 * math.pi * reach**2))
         total = np.bincount(segments[row, column], weight, minlength=int(segments.max()) + 1)
-        of_segment.append(total.astype(np.float64))  # without features they are integers
-    if points.flow is not None:
-        flow = points.flow.astype(np.float32)
-        for kind, votes in enumerate(cv2.resize(m, (w, h), interpolation=cv2.INTER_AREA) for m in flow[::-1]):
-            near[kind] += votes
-            of_segment[kind] += np.bincount(segments.ravel(), votes.ravel(), minlength=len(of_segment[kind]))
-    of_segment = [np.r_[0.0, total[1:]].astype(np.float32) for total in of_segment]
+        total[0] = 0.0
+        of_segment.append(total.astype(np.float32))
     # Only what moves spreads in its segment: a distractor of the background's colour shares the background's.
     # Large segments hold both kinds, so their vote is small and decides only far from features.
     excess = np.maximum(of_segment[0] - of_segment[1], 0.0) / np.maximum(of_segment[0] + of_segment[1], 1.0)
+    if points.flow is not None:
+        stays, moves = (
+            cv2.resize(votes, (w, h), interpolation=cv2.INTER_AREA)
+            for votes in points.flow.astype(np.float32)
+        )
+        near = [near[0] + moves, near[1] + stays]
+        # flow tells of every pixel, so those of which it says nothing count, too
+        share = np.bincount(segments.ravel(), np.sign(moves - stays).ravel())
+        share /= np.maximum(np.bincount(segments.ravel()), 1)
+        share[0] = 0.0
+        excess = np.maximum(excess, share.astype(np.float32))
     moving, static = near[0] + np.float32(SEGMENT_VOTES) * excess[segments], near[1]
     return np.asarray((moving + UNSURE / 2) / (moving + static + UNSURE), np.float32)
 

@@ -67,8 +67,8 @@ def moving_map(points: MotionPoints, labels: np.ndarray, shape: tuple[int, int])
         )
         near = [near[0] + moves, near[1] + stays]
         # flow tells of every pixel, so those of which it says nothing count, too
-        share = np.bincount(segments.ravel(), np.sign(moves - stays).ravel())
-        share /= np.maximum(np.bincount(segments.ravel()), 1)
+        areas = np.maximum(np.bincount(segments.ravel()), 1)
+        share = np.bincount(segments.ravel(), np.sign(moves - stays).ravel()) / areas
         share[0] = 0.0
         excess = np.maximum(excess, share.astype(np.float32))
     moving, static = near[0] + np.float32(SEGMENT_VOTES) * excess[segments], near[1]

@@ -68,11 +68,12 @@ class SequenceFrame:
     def rotation_flow(self, other: SequenceFrame) -> np.ndarray:
         """Return the flow [H, W, 2] float32 that the rotation between two frames causes, of far points."""
         rotation = other.cam_from_world[:3, :3] @ self.cam_from_world[:3, :3].T
-        h, w = self.grey.shape
-        xy = np.dstack([*np.meshgrid(np.arange(w), np.arange(h)), np.ones((h, w))])
+        x, y = self.map_positions()  # far fewer pixels, as the field is smooth
+        xy = np.dstack([x, y, np.ones_like(x)])
         ahead = xy @ (other.intrinsics @ rotation @ np.linalg.inv(self.intrinsics)).T
         there = ahead[..., :2] / np.maximum(ahead[..., 2:], 1e-6)
-        return np.clip(there - xy[..., :2], -SIDE, SIDE).astype(np.float32)
+        flow = np.clip(there - xy[..., :2], -SIDE, SIDE).astype(np.float32)
+        return cv2.resize(flow, self.grey.shape[::-1])
 
 
 @dataclass(frozen=True)
@@ -133,12 +134,14 @@ def flow_votes(
         grey = cv2.resize(read(names[k]), size, interpolation=cv2.INTER_AREA)
         return SequenceFrame(grey, intrinsics, image.cam_from_world())
 
-    def pair(ab: tuple[int, int]) -> tuple[Matches, Matches]:
-        return _matches(frame(ab[0]), frame(ab[1]))
+    probed: dict[tuple[int, int], tuple[Matches, Matches]] = {}
 
-    probed = np.unique(np.linspace(0, count - 2, PROBES).astype(int)).tolist()
-    neighbours = in_order(pair, [(k, k + 1) for k in probed], threads)
-    if np.median([there.returned for there, _ in neighbours]) < SEQUENCE:
+    def pair(ab: tuple[int, int]) -> tuple[Matches, Matches]:
+        return probed.get(ab) or _matches(frame(ab[0]), frame(ab[1]))
+
+    probes = [(k, k + 1) for k in np.unique(np.linspace(0, count - 2, PROBES).astype(int)).tolist()]
+    probed.update(zip(probes, in_order(pair, probes, threads), strict=True))
+    if np.median([there.returned for there, _ in probed.values()]) < SEQUENCE:
         return
     tracked = any((image.point_ids >= 0).any() for image in images.values())
     known: dict[int, dict[int, Matches]] = {k: {} for k in range(count)}

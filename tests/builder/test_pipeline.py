@@ -111,6 +111,7 @@ def test_scene_json_keeps_its_keys_and_their_order(scene):
         "photos", "readable", "registered", "train", "test", "cameras", "points", "points_seen_in_test_only",
         "points_of_track_length_2", "pairs", "pairs_verified", "features_that_stay",
         "features_that_move",
+        "photos_of_sequence",
     ]  # fmt: skip
     lens = ["model", "width", "height", "params"]
     assert list(info["cameras"][0]) == ["photos", "focal_px", "focal_sd_px", *lens]

@@ -76,6 +76,8 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
     before = set(sys.modules)
     # first, as Python does for a script; afterwards last, for imports in functions, where it hides nothing
     sys.path.insert(0, str(folder))
+    # nothing is left beside the file, and one that was edited within a second is not taken from a cache
+    writes, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         spec.loader.exec_module(module)
     except AwError as error:
@@ -88,6 +90,7 @@ def import_file(path: Path) -> tuple[ModuleType, str]:
             why += "; Parts is MethodHooks of ambiguous_wild.splat.method_hooks now"
         raise AwError(f"plugin {path} fails when it is loaded: {why}") from error
     finally:
+        sys.dont_write_bytecode = writes
         sys.path.remove(str(folder))
         if str(folder) not in sys.path:
             sys.path.append(str(folder))

@@ -144,21 +144,18 @@ def flow_votes(
     if np.median([there.returned for there, _ in probed.values()]) < SEQUENCE:
         return
     tracked = any((image.point_ids >= 0).any() for image in images.values())
-    known: dict[int, dict[int, Matches]] = {k: {} for k in range(count)}
+    matches_of: dict[int, dict[int, Matches]] = {k: {} for k in range(count)}
     pairs = [(a, b) for b in range(count) for a in range(max(b - REACH, 0), b)]
-    found = in_order(pair, pairs, threads)
+    of_pairs = in_order(pair, pairs, threads)
     for latest in range(count + REACH):
         for earlier in range(max(latest - REACH, 0), latest if latest < count else 0):
-            known[earlier][latest], known[latest][earlier] = next(found)
+            matches_of[earlier][latest], matches_of[latest][earlier] = next(of_pairs)
         if (complete := latest - REACH) >= 0:
             near = range(max(complete - POINTS_FROM, 0), min(complete + POINTS_FROM + 1, count))
             ids = np.unique(np.concatenate([images[names[n]].point_ids for n in near]))
             xyz = model.points.xyz[np.isin(model.points.ids, ids)]
-            others = [(frame(n), m) for n, m in known.pop(complete).items() if m.returned >= FLOWS]
-            yield (
-                names[complete],
-                count_votes(frame(complete), others, xyz if tracked else None),
-            )
+            others = [(frame(n), m) for n, m in matches_of.pop(complete).items() if m.returned >= FLOWS]
+            yield names[complete], count_votes(frame(complete), others, xyz if tracked else None)
 
 
 def _matches(first: SequenceFrame, second: SequenceFrame) -> tuple[Matches, Matches]:

@@ -38,11 +38,12 @@ from ambiguous_wild.harness.store import (
     read_config,
 )
 from ambiguous_wild.harness.timing import timing_of
-from ambiguous_wild.io.files import own_json, sha256_file
+from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.report.board import ALONE, COST, FIRST, LAST, Entry, check_text
 from ambiguous_wild.report.board_reproduce import (
     Scenes,
+    chosen_by_plan,
     command,
     hardware,
     options_hash,
@@ -174,9 +175,9 @@ def _config(run: Path) -> RunConfig:
 
 def _words(run: Path, config: RunConfig, before: list[str], recorded: str) -> tuple[str, str]:
     """Return (setting, commands) of a configuration, which a stranger may have written."""
-    planned = _planned(run, config)
+    by_plan = _by_plan(run, config)
     try:
-        words = check_text(f"setting of {run}", setting(config, planned))
+        words = check_text(f"setting of {run}", setting(config, by_plan))
         return words, command(config, before, recorded)
     except AwError as error:
         raise AwError(f"{run}: {error}") from None
@@ -184,11 +185,11 @@ def _words(run: Path, config: RunConfig, before: list[str], recorded: str) -> tu
         raise AwError(f"{run / 'config.yaml'} was not written by 'aw bench' ({error}): {RESTORE}") from None
 
 
-def _planned(run: Path, config: RunConfig) -> bool:
+def _by_plan(run: Path, config: RunConfig) -> bool:
     """Return whether the plan of the scene chose the run's effects."""
     if config.get("effects") and not (run / EFFECTS).is_file():
         _partial(run, f"it lacks {EFFECTS}, which says who chose its effects")
-    return bool(own_json(run / EFFECTS).get("asked") == "auto")
+    return chosen_by_plan(run)
 
 
 def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:

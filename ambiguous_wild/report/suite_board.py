@@ -17,6 +17,7 @@ from pathlib import Path
 import ambiguous_wild
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.grouping import grouped
+from ambiguous_wild.datasets.suites import Suite
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.measures import MEASURES, Measure
 from ambiguous_wild.harness.result_file import RunConfig
@@ -208,7 +209,17 @@ def _table(
     failed = [f"failed: {m.name} on {shortlist(sorted(m.failed))}" for m in own if m.failed]
     references = [m.name for m in methods if not m.ranked]
     known = [f"references, not ranked: {shortlist(references)}"] if references else []
-    return Table(title, tuple(columns), tuple(marked), tuple([*failed, *known]))
+    return Table(title, tuple(columns), tuple(marked), tuple([*failed, *known, *_undefined(suite, methods)]))
+
+
+def _undefined(suite: Suite, methods: Sequence[MethodScores]) -> list[str]:
+    """Return a line for each measure that some scenes cannot have: their means are over the others."""
+    lines = []
+    for key in MEASURED:
+        without = [s for s in suite.scenes if not any(method.has(s, key) for method in methods)]
+        if 0 < len(without) < len(suite.scenes):
+            lines.append(f"{MEASURES[key].label}: no method has it on {shortlist(without)}, left out of the means")
+    return lines
 
 
 def _cell(method: MethodScores, scenes: Sequence[str], measure: Measure) -> TableCell:
@@ -249,13 +260,12 @@ def _differences(
 
 def _pair(a: MethodScores, b: MethodScores, measure: Measure, scenes: Sequence[str]) -> list[str] | None:
     """Return the row of a pair; None where no scene has a value of both."""
-    failed = sorted(a.failed & {*scenes})
     key, digits = measure.key, measure.digits
     own = [a.value(s, key) - b.value(s, key) for s in scenes if a.has(s, key) and b.has(s, key)]
     if not own:
         return None
     head = [a.name, b.name, f"{measure.label}{ARROWS[measure.better]}"]
-    if failed:  # a method must not gain by failing on hard scenes
+    if (a.failed | b.failed) & {*scenes}:  # a method must not gain by failing on hard scenes
         return [*head, "failed", "", "", f"{len(own)}"]
     interval = stats.mean_interval(own)
     between = interval_text(interval, digits)

@@ -1,4 +1,4 @@
-"""The exact cameras of a simulated capture, instead of estimated ones, and known cameras in COLMAP's database."""
+"""Exact cameras of a simulated capture instead of estimated ones; known cameras in COLMAP's database."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def read_known_cameras(truth: Path | None, photos: Sequence[ScreenedPhoto]) -> C
     names = [_name_in_truth(photo.source) for photo in photos]
     if absent := [photo.source for photo, name in zip(photos, names) if name not in known]:
         raise AwError(
-            f"{path} has no camera of {counted(len(absent), 'photo')}: {shortlist(absent, 3)}; take these away, or "
-            f"{ESTIMATE}"
+            f"{path} has no camera of {counted(len(absent), 'photo')}: {shortlist(absent, 3)}; take "
+            f"these away, or {ESTIMATE}"
         )
     cameras: dict[tuple[object, ...], ModelCamera] = {}
     images = {}
@@ -90,8 +90,8 @@ def _lens(where: str, camera: KnownCamera, photo: ScreenedPhoto) -> tuple[float,
     """Return the parameters of SIMPLE_RADIAL: focal length, centre, k1."""
     if (camera.width, camera.height) != photo.size:
         raise AwError(
-            f"{where} is {camera.width}x{camera.height}, but the photo {photo.width}x{photo.height}: the cameras "
-            f"belong to another capture; {ESTIMATE}"
+            f"{where} is {camera.width}x{camera.height}, but the photo {photo.width}x{photo.height}: "
+            f"the cameras belong to another capture; {ESTIMATE}"
         )
     k1, k2 = (camera.distortion.get(key, 0.0) for key in ("k1", "k2"))
     if k2 or camera.fx != camera.fy:

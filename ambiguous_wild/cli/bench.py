@@ -349,7 +349,6 @@ def _made(suite: Suite, root: Path, poses: str, output: Path) -> PreparedSuite:
         return prepare_simulated(suite, root, exact_poses=poses == "truth", progress=True, say=say)
 
 
-
 def _print_tables(prepared: PreparedSuite, folder: Path, factor: int | None) -> None:
     from ambiguous_wild.report.plain_formats import to_text
 

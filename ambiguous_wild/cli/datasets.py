@@ -132,8 +132,13 @@ def fetch_command(name: str | None, output: Path, as_json: bool) -> None:
             click.echo(json.dumps(rows, indent=2, ensure_ascii=False))
             return
         for suite in suites.values():
-            say(f"{suite.name:<29}  simulated here, nothing is downloaded, licence: {suite.license}", out=True)
-            say(f"{'':<29}  {counted(len(suite.scenes), 'capture')} with exact truth; docs/datasets.md", out=True)
+            say(
+                f"{suite.name:<29}  simulated here, nothing is downloaded, licence: {suite.license}", out=True
+            )
+            say(
+                f"{'':<29}  {counted(len(suite.scenes), 'capture')} with exact truth; docs/datasets.md",
+                out=True,
+            )
         for data in public_data().values():
             size = f"{data.size_mb} MB" if data.size_mb else "size not stated"
             how = f"layout {data.layout}, {size}" if data.url else "from its page only"
@@ -349,4 +354,6 @@ def _print_captures(folder: Path, found: VerifiedCaptures, as_json: bool) -> Non
             out=True,
         )
     if found.damaged:
-        raise AwError(f"{counted(len(found.damaged), 'capture')} of {folder} cannot be used: {found.damaged[0]}")
+        raise AwError(
+            f"{counted(len(found.damaged), 'capture')} of {folder} cannot be used: {found.damaged[0]}"
+        )

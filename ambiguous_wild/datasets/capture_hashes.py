@@ -1,7 +1,7 @@
 """Simulated captures of suites: whether one is whole, and whether it is the one that everybody has.
 
-A capture is identified by its pixels and cameras, not by the bytes of its files, which depend on the versions of
-encoders. Other versions of what computes the pixels may change them: the hash then differs from the listed one.
+A capture is identified by its pixels and cameras, not by the bytes of its files, which depend on the
+encoders. Other versions of what computes the pixels may change them: then the hash is not the listed one.
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ def check_capture(capture: Path, name: str, suite: Suite) -> CheckedCapture:
     spec, files, version = record.get("spec"), record.get("files"), record.get("version")
     if made is None or not isinstance(spec, dict) or not isinstance(files, dict):
         raise AwError(
-            f"{capture} exists and is no whole capture of 'aw simulate': move it away, then 'aw fetch {suite.name}' "
-            f"makes {name} there"
+            f"{capture} exists and is no whole capture of 'aw simulate': move it away, then "
+            f"'aw fetch {suite.name}' makes {name} there"
         )
     asked = {"preset": name, "seed": made.seed, "width": made.width}
     there = {"preset": record.get("preset"), "seed": record.get("seed"), "width": spec.get("width")}
@@ -131,8 +131,8 @@ def list_lines(checked: Sequence[CheckedCapture]) -> list[str]:
     if other := [capture.name for capture in checked if capture.differs]:
         made_by = shortlist(sorted({capture.version for capture in checked if capture.differs}))
         lines.append(
-            f"warning: {shortlist(other, 20)}: other pixels or cameras than those that everybody has, so results "
-            "are not comparable with the board; likely another version of numpy, OpenCV, scikit-image or "
+            f"warning: {shortlist(other, 20)}: pixels or cameras differ from the listed ones, so results are "
+            "not comparable with the board; likely another version of numpy, OpenCV, scikit-image or "
             f"ambiguous-wild ({made_by}), or another processor"
         )
     if unknown := [capture.name for capture in checked if not capture.listed]:
@@ -161,9 +161,9 @@ class VerifiedCaptures:
 
 
 def suite_of_captures(folder: Path) -> Suite | None:
-    """Return the simulated suite whose captures lie in a folder, the largest of its dataset; None without any.
+    """Return the simulated suite whose captures lie in a folder, by their width; None without any.
 
-    It is told by the width of the photos.
+    Of suites with the same captures it is the one with most scenes.
     """
     widths = {_width(record) for record in sorted((folder / CAPTURES).glob(f"*/{RECORD.as_posix()}"))}
     fitting = [s for s in simulated_suites().values() if s.simulated and s.simulated.width in widths]

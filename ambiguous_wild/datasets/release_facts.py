@@ -103,7 +103,7 @@ def with_simulated(info: ReleaseInfo, scenes: Mapping[str, Facts]) -> ReleaseInf
         return info
     known = {
         "title": f"Simulated scenes: {shortlist(scenes, 20)}",
-        "description": "Ray-cast captures with distractors, clean test photos and exact truth, by 'aw simulate'.",
+        "description": "Ray-cast captures with distractors, clean test photos and exact truth",
         "creators": ("ambiguous-wild",),
         "license": SIMULATED_LICENSE,
         "consent": "not needed: simulated, no people, no personal data",

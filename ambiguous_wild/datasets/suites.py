@@ -175,8 +175,7 @@ def simulated_dataset(capture: Mapping[str, Any], factor: object) -> str | None:
     spec = capture.get("spec")
     width = spec.get("width") if isinstance(spec, dict) else None
     for suite in suites().values():
-        made = suite.simulated
-        if made and (made.width, made.seed, suite.factor) == (width, capture.get("seed"), factor):
-            if capture.get("preset") in suite.scenes:
-                return suite.dataset
+        made, known = suite.simulated, capture.get("preset") in suite.scenes
+        if made and known and (made.width, made.seed, suite.factor) == (width, capture.get("seed"), factor):
+            return suite.dataset
     return None

@@ -80,8 +80,8 @@ def _check_root(suite: Suite, root: Path) -> None:
     """Refuse a folder of something else, before anything is written into it."""
     if not is_free(root) and not (root / CAPTURES).is_dir():
         raise AwError(
-            f"{root} exists and has no folder {CAPTURES} of {suite.name}: name a new or empty folder, or that of "
-            "an earlier 'aw fetch'"
+            f"{root} exists and has no folder {CAPTURES} of {suite.name}: name a new or empty folder, or "
+            "that of an earlier 'aw fetch'"
         )
     check_output(root / CAPTURES / "capture")
 
@@ -91,8 +91,8 @@ def _checked(suite: Suite, name: str, folder: Path, spec: CaptureSpec) -> Checke
     capture = check_capture(folder, name, suite)
     if capture.spec != json.loads(json.dumps(plain_spec(spec))):
         raise AwError(
-            f"{folder} was made by another version of the preset {name} ({capture.version}): remove it, and the "
-            f"scene that was built from it, then 'aw fetch {suite.name}' makes it again"
+            f"{folder} was made by another version of the preset {name} ({capture.version}): remove it, and "
+            f"the scene that was built from it, then 'aw fetch {suite.name}' makes it again"
         )
     return capture
 
@@ -147,7 +147,7 @@ def prepare_simulated(
             if "--overwrite" not in str(error):
                 raise AwError(f"{name}: {error}") from error
             raise AwError(
-                f"{scene} is damaged, or was built from another capture, by other settings or versions: remove "
-                "it, and the same command builds it again"
+                f"{scene} is damaged, or was built from another capture, by other settings or versions: "
+                "remove it, and the same command builds it again"
             ) from error
     return PreparedSuite(suite, folders, (), exact_poses)

@@ -1,7 +1,7 @@
-"""The table of a simulated suite: our rows by kind of ambiguity, the board's beside them, and paired differences.
+"""The table of a simulated suite: our rows by kind of ambiguity, the board's rows, and paired differences.
 
-A run of the board stands beside ours if it has the same dataset, poses, setting, size and seeds, and belongs to a
-method that has such runs on all scenes; what is left out is said.
+A run of the board stands beside ours if it has the same dataset, poses, setting, size and seeds, and belongs
+to a method that has such runs on all scenes; what is left out is said.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import ambiguous_wild
 from ambiguous_wild.core.errors import AwError, counted, shortlist
@@ -99,11 +100,14 @@ def _own(
         for name, scene in prepared.scenes.items()
     }
     images = runs.images[runs.images["metric"] == "psnr"]
-    psnr = {key: stats.mean(of.to_numpy()) for key, of in images.groupby(["scene", "method", "seed"])["value"]}
+    psnr = {
+        key: stats.mean(of.to_numpy()) for key, of in images.groupby(["scene", "method", "seed"])["value"]
+    }
     methods: dict[str, MethodScores] = {}
     settings: dict[str, set[str]] = {}
     other = []
-    for run in runs.runs[runs.runs["scene"].isin(list(hashes))].itertuples():
+    rows: Any = runs.runs[runs.runs["scene"].isin(list(hashes))].itertuples()
+    for run in rows:
         if run.scene_hash != hashes[run.scene]:
             other.append(f"{run.method} on {run.scene}")
             continue
@@ -136,7 +140,9 @@ def _of_board(
     entries = [] if board is None else [e for e in read_board(board) if e.dataset == dataset]
     entries = [e for e in entries if e.scene in scenes]
     if not entries:
-        where = "no folder leaderboard here" if board is None else f"no runs in {dataset_file(board, dataset)}"
+        where = (
+            "no folder leaderboard here" if board is None else f"no runs in {dataset_file(board, dataset)}"
+        )
         return [], [f"no rows of the board: {where}"]
     why: Counter[str] = Counter()
     fitting = []
@@ -209,7 +215,7 @@ def _table(
     failed = [f"failed: {m.name} on {shortlist(sorted(m.failed))}" for m in own if m.failed]
     references = [m.name for m in methods if not m.ranked]
     known = [f"references, not ranked: {shortlist(references)}"] if references else []
-    return Table(title, tuple(columns), tuple(marked), tuple([*failed, *known, *_undefined(suite, methods)]))
+    return Table(title, tuple(columns), tuple(marked), (*failed, *known, *_undefined(suite, methods)))
 
 
 def _undefined(suite: Suite, methods: Sequence[MethodScores]) -> list[str]:
@@ -218,7 +224,9 @@ def _undefined(suite: Suite, methods: Sequence[MethodScores]) -> list[str]:
     for key in MEASURED:
         without = [s for s in suite.scenes if not any(method.has(s, key) for method in methods)]
         if 0 < len(without) < len(suite.scenes):
-            lines.append(f"{MEASURES[key].label}: no method has it on {shortlist(without)}, left out of the means")
+            lines.append(
+                f"{MEASURES[key].label}: no method has it on {shortlist(without)}, left out of the means"
+            )
     return lines
 
 
@@ -232,7 +240,8 @@ def _cell(method: MethodScores, scenes: Sequence[str], measure: Measure) -> Tabl
         return TableCell(state=state)
     seeds = sorted({seed for scene in scenes for seed in method.scenes[scene]})
     means = [
-        stats.mean([method.scenes[s].get(seed, {}).get(measure.key, math.nan) for s in scenes]) for seed in seeds
+        stats.mean([method.scenes[s].get(seed, {}).get(measure.key, math.nan) for s in scenes])
+        for seed in seeds
     ]
     return TableCell(value, stats.sample_std(means))
 
@@ -244,14 +253,16 @@ def _differences(
     others = {method.name: method for method in board}
     others = {name: others[name + BOARD] for name in REFERENCES if name + BOARD in others}
     others = {method.name: method for method in own if method.name in REFERENCES} | others
-    pairs = [(a, others[name]) for a in own for name in REFERENCES if name in others and others[name] is not a]
+    pairs = [
+        (a, others[name]) for a in own for name in REFERENCES if name in others and others[name] is not a
+    ]
     rows = [row for a, b in pairs for key in MEASURED if (row := _pair(a, b, MEASURES[key], scenes))]
     if not rows:
         return None
     head = ["difference of", "to", "measure", "mean", "95 %", "w/t/l", "scenes"]
     notes = (
-        "95 %: other scenes (Student's t, paired by scene); w/t/l: scenes on which it is better, equal as printed, "
-        "and worse",
+        "95 %: other scenes (Student's t, paired by scene); w/t/l: scenes on which it is better, equal as "
+        "printed, and worse",
     )
     return dataclasses.replace(
         text_table("paired differences", head, rows, words=("to", "measure")), notes=notes

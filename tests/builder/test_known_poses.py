@@ -1,4 +1,4 @@
-"""Scenes with the exact cameras of a simulated capture. Oracle: truth/cameras.json, which the photos were made by."""
+"""Scenes with exact cameras. Oracle: truth/cameras.json of the simulator, which the photos were made with."""
 
 from __future__ import annotations
 
@@ -107,10 +107,16 @@ def spoilt(change, captures: dict[str, Path], tmp_path: Path) -> Path:
     ("change", "message"),
     [
         (lambda c: c.pop("IMG_0002.jpg"), r"no camera of 1 photo: train/IMG_0002.jpg"),
-        (lambda c: c["IMG_0002.jpg"].update(distortion={"k1": -0.1, "k2": 0.01}), "k2 is 0.01.*SIMPLE_RADIAL"),
+        (
+            lambda c: c["IMG_0002.jpg"].update(distortion={"k1": -0.1, "k2": 0.01}),
+            "k2 is 0.01.*SIMPLE_RADIAL",
+        ),
         (lambda c: c["IMG_0002.jpg"].update(fy=1.0), "fy 1, which COLMAP's SIMPLE_RADIAL"),
         (lambda c: c["IMG_0002.jpg"].update(width=99), r"99x\d+, but the photo 240x"),
-        (lambda c: c["IMG_0002.jpg"].update(cam_from_world=[[1.0] * 4] * 4), "no rotation with a translation"),
+        (
+            lambda c: c["IMG_0002.jpg"].update(cam_from_world=[[1.0] * 4] * 4),
+            "no rotation with a translation",
+        ),
         (lambda c: c["IMG_0002.jpg"].update(cam_from_world=[[1.0]]), "no matrix of 4x4"),
         (lambda c: c["IMG_0002.jpg"].pop("fx"), "holds no cameras of 'aw simulate'"),
     ],

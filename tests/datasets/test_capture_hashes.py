@@ -1,4 +1,4 @@
-"""Simulated captures of suites: what identifies one, and what is said of one that is not whole or not the same."""
+"""Simulated captures of suites: what identifies one, and what is said of one that is not whole or another."""
 
 from __future__ import annotations
 
@@ -55,7 +55,10 @@ def test_the_hash_is_of_pixels_and_not_of_files(made: Path, capture: Path) -> No
         Image.open(path).save(path, compress_level=9)
         assert path.read_bytes() != before
     (capture / "truth" / "sheet.jpg").write_bytes(b"a preview")
-    change_json(capture / "truth" / "cameras.json", lambda c: c["IMG_0001.jpg"].update(fx=c["IMG_0001.jpg"]["fx"] + 1e-12))
+    change_json(
+        capture / "truth" / "cameras.json",
+        lambda c: c["IMG_0001.jpg"].update(fx=c["IMG_0001.jpg"]["fx"] + 1e-12),
+    )
     assert capture_hash(capture) == capture_hash(made)
 
 
@@ -88,7 +91,9 @@ def test_the_size_of_an_image_counts(made: Path, capture: Path) -> None:
     assert len(found) == 3
 
 
-def test_a_capture_is_compared_with_the_list(made: Path, capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_capture_is_compared_with_the_list(
+    made: Path, capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     unlisted = check_capture(capture, "tiny", TOY)
     assert unlisted.listed == "" and not unlisted.differs and unlisted.sha256 == capture_hash(made)
     assert list_lines([unlisted, replace(unlisted, name="other")]) == [
@@ -101,18 +106,29 @@ def test_a_capture_is_compared_with_the_list(made: Path, capture: Path, monkeypa
     other = check_capture(capture, "tiny", TOY)
     assert other.differs
     (line,) = list_lines([other])
-    assert line.startswith("warning: tiny: other pixels") and "not comparable with the board" in line
+    assert (
+        line.startswith("warning: tiny: pixels or cameras differ") and "not comparable with the board" in line
+    )
 
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda c: (c / "train" / "IMG_0001.jpg").write_bytes(b"short"), r"is damaged \(1 file absent or changed"),
-        (lambda c: (c / "test" / "IMG_0101.jpg").unlink(), "test/IMG_0101.jpg.*'aw fetch toy' makes it again"),
+        (
+            lambda c: (c / "train" / "IMG_0001.jpg").write_bytes(b"short"),
+            r"is damaged \(1 file absent or changed",
+        ),
+        (
+            lambda c: (c / "test" / "IMG_0101.jpg").unlink(),
+            "test/IMG_0101.jpg.*'aw fetch toy' makes it again",
+        ),
         (lambda c: (c / "truth" / "capture.json").unlink(), "no whole capture of 'aw simulate'"),
         (lambda c: (c / "truth" / "capture.json").write_text("{"), "no whole capture"),
         (lambda c: change_json(c / "truth" / "capture.json", lambda f: f.update(seed=0)), "seed 0, not 5"),
-        (lambda c: change_json(c / "truth" / "capture.json", lambda f: f["spec"].update(width=99)), "width 99, not 64"),
+        (
+            lambda c: change_json(c / "truth" / "capture.json", lambda f: f["spec"].update(width=99)),
+            "width 99, not 64",
+        ),
     ],
 )
 def test_a_capture_that_is_not_whole_is_refused_in_one_line(spoil, message: str, capture: Path) -> None:

@@ -1,4 +1,4 @@
-"""Suites that are simulated here: what is missing is made, what is there is checked, nothing else is touched."""
+"""Suites that are simulated here: what is missing is made, what is there is checked, other files stay."""
 
 from __future__ import annotations
 
@@ -82,10 +82,10 @@ def test_an_interrupted_call_goes_on_with_the_next_capture(tmp_path: Path, monke
 
 
 def test_what_is_there_is_kept_and_checked(root: Path) -> None:
-    before = {p: p.stat().st_mtime_ns for p in root.rglob("*")}
+    before = {p: p.stat().st_mtime_ns for p in root.rglob("*") if p.is_file()}
     prepared = prepare_simulated(TOY, root, exact_poses=True)
     assert prepared.scenes == {name: root / "scenes-truth" / name for name in NAMES} and prepared.exact_poses
-    assert {p: p.stat().st_mtime_ns for p in root.rglob("*")} == before
+    assert {p: p.stat().st_mtime_ns for p in root.rglob("*") if p.is_file()} == before
     info = read_scene_json(prepared.scenes["toy-a"])
     assert info is not None and info["factor"] == 2 and dict(info)["license"] == "CC0-1.0"
 
@@ -93,12 +93,14 @@ def test_what_is_there_is_kept_and_checked(root: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda r: (r / "captures" / "toy-b" / "train" / "IMG_0001.jpg").write_bytes(b"x"), "toy-b is damaged"),
-        (lambda r: (r / "scenes-truth" / "toy-a" / "map.png").write_bytes(b"x"), "toy-a is damaged, or was built"),
-        (lambda r: shutil.copytree(r / "captures" / "toy-a", r / "captures" / "toy-b", dirs_exist_ok=True),
-         "preset toy-a, not toy-b"),
+        (lambda r: (r / "captures/toy-b/train/IMG_0001.jpg").write_bytes(b"x"), "toy-b is damaged"),
+        (lambda r: (r / "scenes-truth/toy-a/map.png").write_bytes(b"x"), "toy-a is damaged, or was built"),
+        (
+            lambda r: shutil.copytree(r / "captures/toy-a", r / "captures/toy-b", dirs_exist_ok=True),
+            "preset toy-a, not toy-b",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_is_damaged_is_one_line(spoil, message: str, root: Path) -> None:
     spoil(root)
     with pytest.raises(AwError, match=message) as error:
@@ -127,13 +129,24 @@ def test_nothing_is_written_among_other_files(tmp_path: Path) -> None:
 
 
 def test_as_it_is_typed(root: Path, tmp_path: Path) -> None:
-    """An own method beside the references, from the captures to the table; the second call keeps all of it."""
+    """An own method, from captures to the table beside the references; the second call keeps it all."""
     (tmp_path / "mine.py").write_text(
         "from ambiguous_wild.methods.entry import NoOptions\n"
         "from ambiguous_wild.splat.method_hooks import MethodHooks\n\n\n"
         "def mine(options: NoOptions) -> MethodHooks:\n    return MethodHooks()\n"
     )
-    words = ["bench", "--suite", TOY.name, "--scene", root, "--poses", "truth", "-o", tmp_path / "runs", *TRAIN]
+    words = [
+        "bench",
+        "--suite",
+        TOY.name,
+        "--scene",
+        root,
+        "--poses",
+        "truth",
+        "-o",
+        tmp_path / "runs",
+        *TRAIN,
+    ]
     words += ["--method", f"3dgs,{tmp_path / 'mine.py'}:mine"]
     done = aw(*words)
     assert done.returncode == 0, done.stderr

@@ -49,7 +49,9 @@ def psnr(root: Path, method: str, seeds: tuple[int, ...] = (0,)) -> dict[str, fl
     for path in sorted(root.rglob("metrics.json")):
         result = json.loads(path.read_text())
         if result["method"] == method and result["seed"] in seeds:
-            found.setdefault(result["scene"], []).append(np.mean([row["psnr"] for row in result["per_image"]]))
+            found.setdefault(result["scene"], []).append(
+                np.mean([row["psnr"] for row in result["per_image"]])
+            )
     return {scene: float(np.mean(values)) for scene, values in found.items()}
 
 

@@ -15,7 +15,6 @@ from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain
 from ambiguous_wild.datasets.suites import simulated_dataset
-from ambiguous_wild.harness.cell_run import EFFECTS
 from ambiguous_wild.harness.command_lines import option_text
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
 from ambiguous_wild.harness.trained_models import Opened, open_scene
@@ -56,11 +55,6 @@ def setting(config: RunConfig, planned: bool = False) -> str:
     if train.get("max_gaussians") is not None:
         words.append(f"at most {train['max_gaussians']} Gaussians")
     return ", ".join(words)
-
-
-def chosen_by_plan(run: Path) -> bool:
-    """Return whether the plan of the scene chose the run's effects."""
-    return bool(own_json(run / EFFECTS).get("asked") == "auto")
 
 
 def dataset_of(name: str, exact_poses: bool) -> str:

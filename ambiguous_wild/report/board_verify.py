@@ -38,12 +38,11 @@ from ambiguous_wild.harness.store import (
     read_config,
 )
 from ambiguous_wild.harness.timing import timing_of
-from ambiguous_wild.io.files import sha256_file
+from ambiguous_wild.io.files import own_json, sha256_file
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.report.board import ALONE, COST, FIRST, LAST, Entry, check_text
 from ambiguous_wild.report.board_reproduce import (
     Scenes,
-    chosen_by_plan,
     command,
     hardware,
     options_hash,
@@ -190,6 +189,11 @@ def _by_plan(run: Path, config: RunConfig) -> bool:
     if config.get("effects") and not (run / EFFECTS).is_file():
         _partial(run, f"it lacks {EFFECTS}, which says who chose its effects")
     return chosen_by_plan(run)
+
+
+def chosen_by_plan(run: Path) -> bool:
+    """Return whether the plan of the scene chose the run's effects."""
+    return bool(own_json(run / EFFECTS).get("asked") == "auto")
 
 
 def _check_identity(run: Path, result: RunResult, config: RunConfig) -> None:

@@ -27,7 +27,8 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.board import Entry, dataset_file, measured, read_board
-from ambiguous_wild.report.board_reproduce import chosen_by_plan, dataset_of, setting
+from ambiguous_wild.report.board_reproduce import dataset_of, setting
+from ambiguous_wild.report.board_verify import chosen_by_plan
 from ambiguous_wild.report.comparison import ranked
 from ambiguous_wild.report.pairs import counts_of, interval_text
 from ambiguous_wild.report.suite import PreparedSuite

@@ -36,6 +36,10 @@ def run_mapping(job: MappingJob) -> None:
     and the model with more observations is kept.
     """
     output, database = Path(job["output"]), Path(job["database"])
+    if job["known"] is not None:
+        placed = _with_known_cameras(job, database, Path(job["known"]))
+        _write(job, output, placed, [placed], len(placed.poses))
+        return
     ThreadPoolExecutor(1).submit(importlib.import_module, "networkx")  # while COLMAP maps
     matched = Matched.read(database)
     models = _models(job, output, matched)
@@ -77,6 +81,49 @@ def run_mapping(job: MappingJob) -> None:
             {**no_model(), "left_out": left_out, "components": names, "reliable": reliable},
         )
         return
+    _write(job, output, chosen, components, reliable)
+
+
+def _with_known_cameras(job: MappingJob, database: Path, known: Path) -> Registration:
+    """Return all photos at their exact poses, with points triangulated from the matches that fit these."""
+    matched = Matched.read(database)  # with the exact cameras
+    matched.find_relative_poses(job["jobs"])
+    model = triangulate_known(database, known, job["photos"], known, job["seed"])
+    placed = Registration(matched, database, model, job["seed"])
+    placed.accept_all()
+    return placed
+
+
+def triangulate_known(database: Path, known: Path, photos: str, output: Path, seed: int) -> Any:
+    """Triangulate points from the inliers of known poses; poses and intrinsics do not change.
+
+    Args:
+        database: its verified pairs are replaced.
+        known: folder of the model with the cameras, numbered as in the database.
+        photos: folder.
+        output: folder for COLMAP's files.
+        seed: of its random choices.
+
+    Returns:
+        the model of pycolmap.
+    """
+    posed = pycolmap.Reconstruction(str(known))
+    matched = Matched.read(database)
+    matched.take_cameras(posed)
+    matched.write_verified(database, matched.verified_pairs(matched.poses(posed)))
+    return pycolmap.triangulate_points(
+        posed, str(database), photos, str(output), options=pipeline_options(seed), refine_intrinsics=False
+    )
+
+
+def _write(
+    job: MappingJob,
+    output: Path,
+    chosen: Registration,
+    components: Sequence[Registration],
+    reliable: int,  # photos of the largest component that are not provisional
+) -> None:
+    """Write the chosen component: its relative poses, its model with colours, and `mapping.json`."""
     chosen.matched.save_relative_poses(output / RELATIVE_POSES)
     model = chosen.model
     model.tear_down()
@@ -89,7 +136,7 @@ def run_mapping(job: MappingJob) -> None:
         "error_px": round(model.compute_mean_reprojection_error(), 4),
         "track_length": round(model.compute_mean_track_length(), 3),
     }
-    name = matched.names
+    name = chosen.matched.names
     write_json(
         output / "mapping.json",
         {

@@ -105,6 +105,12 @@ class Registration:
             if photo not in self.poses:
                 self.left_out.setdefault(photo, "too few placed photos agree with it in the end")
 
+    def accept_all(self) -> None:
+        """Accept the poses of the model as they are, with the photos that support each."""
+        normalised = self.matched.normalised()
+        self.accepted = {k: self._score(k, pose, normalised) for k, pose in self.poses.items()}
+        self.links = self.find_links()
+
     def _register_until_stable(self, times_out: list[int]) -> None:
         """Register all photos anew until none moves; `times_out` counts how often each was taken out."""
         rounds, moved, pairs = 0, True, False

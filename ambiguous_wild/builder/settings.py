@@ -15,7 +15,7 @@ from ambiguous_wild.core.errors import AwError
 
 CameraMode = Literal["auto", "single", "per-device", "per-folder", "per-image"]
 Matcher = Literal["auto", "exhaustive", "sequential", "retrieval"]
-Mapper = Literal["incremental", "global"]
+Mapper = Literal["incremental", "global", "truth"]
 Effort = Literal["auto", "fast", "thorough"]
 
 
@@ -35,7 +35,7 @@ class BuildSettings:
     camera: CameraMode = "auto"  # auto: one camera if EXIF and size agree, else one a device or a photo
     sfm: Effort = "auto"  # auto: fast, then more where it leaves photos out
     matcher: Matcher = "auto"  # auto: exhaustive up to 25 photos (thorough: 200), then retrieval
-    mapper: Mapper = "incremental"  # global is faster on many photos, weaker on few
+    mapper: Mapper = "incremental"  # global: faster on many photos, weaker on few; truth: simulated cameras
     part: int = 1  # of a capture that falls into parts, the one to build; 1 is the largest
     max_features: int = 3000  # SIFT features a photo, as COLMAP counts: up to 5400; thorough: at least 8000
     max_side: int = 1600  # px; photos are reduced to this for SIFT only
@@ -54,6 +54,8 @@ class BuildSettings:
                 f"--max-features must be between 100, to match anything, and {MAX_FEATURES}, "
                 f"got {self.max_features}"
             )
+        if self.mapper == "truth" and (self.camera, self.part) != ("auto", 1):
+            raise AwError("--mapper truth knows cameras and poses: leave out --camera and --part")
         if self.part < 1:
             raise AwError(f"--part must be 1 or more, got {self.part}")
         if not 0 <= self.seed < 2**31:
@@ -83,6 +85,8 @@ class SfmPlan:
 
 def plans(photos: Sequence[ScreenedPhoto], settings: BuildSettings) -> list[SfmPlan]:
     """Return the attempts in order; each next one runs if the one before leaves photos out."""
+    if settings.mapper == "truth":
+        return [_thorough(len(photos), settings) if settings.sfm == "thorough" else _fast(photos, settings)]
     thorough = _thorough(len(photos), settings)
     # Other features find other pairs: a capture that one kind leaves in parts may be whole by the other.
     covariant = replace(thorough, name="covariant", sift="covariant", ratio=LOOSE_RATIO, below=MIN_REGISTERED)

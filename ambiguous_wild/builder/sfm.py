@@ -20,6 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NotRequired, TypedDict, cast
 
 from ambiguous_wild.builder.fixed_to_camera import FIXED
+from ambiguous_wild.builder.known_poses import set_cameras
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
     FeatureResult,
@@ -32,6 +33,7 @@ from ambiguous_wild.builder.retrieval import PAIRS, RELATIVE_POSES
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.processes import python_command
+from ambiguous_wild.io.colmap_records import ColmapModel
 from ambiguous_wild.io.files import write_json
 
 LOG = "colmap.log"
@@ -84,6 +86,7 @@ class MappingJob(TypedDict):
     task: Literal["mapping"]
     database: str
     relative_poses: str  # file that the stage `matches` wrote
+    known: str | None  # folder of a model with the exact cameras, numbered as in the database; None: map
     photos: str  # folder
     output: str  # folder
     progress: str  # file that holds the number of registered photos
@@ -289,24 +292,33 @@ class StructureFromMotion:
             fixed = json.loads((folder / FIXED).read_text(encoding="utf-8"))
         return cast(MatchResult, {"matcher": matcher, "pairs": pairs, **counts, "fixed": fixed})
 
-    def map(self, folder: Path, matches: Path, connected: int) -> MappingResult:
+    def map(
+        self, folder: Path, matches: Path, connected: int, known: ColmapModel | None = None
+    ) -> MappingResult:
         """Build the model into `folder/0`; it has none if pairs connect too few photos for the plan.
 
         Args:
             folder: folder of the stage.
             matches: folder of the stage `matches`.
             connected: photos that verified pairs connect.
+            known: exact cameras, which are taken instead of mapping; None: there are none.
         """
         plan, settings = self.plan, self.settings
-        if connected < plan.worth * len(self.photos):
+        if known is None and connected < plan.worth * len(self.photos):
             return {**no_model(), "plan": plan.name}
         progress, database = folder / "progress", folder / DATABASE
-        self.bar.start("placing photos", len(self.photos) if settings.mapper == "incremental" else None)
+        counted = settings.mapper == "incremental"
+        self.bar.start("placing photos", len(self.photos) if counted else None)
         shutil.copyfile(matches / DATABASE, database)  # the mapper may write to it
+        cameras = None
+        if known is not None:
+            cameras = folder / "known"
+            set_cameras(database, cameras, known, {image.name: image for image in known.images.values()})
         job: MappingJob = {
             "task": "mapping",
             "database": str(database),
             "relative_poses": str(matches / RELATIVE_POSES),
+            "known": str(cameras) if cameras else None,
             "photos": str(self.folder),
             "output": str(folder),
             "progress": str(progress),
@@ -327,6 +339,8 @@ class StructureFromMotion:
         self.bar.finish()
         database.unlink()
         progress.unlink(missing_ok=True)
+        if cameras is not None:
+            shutil.rmtree(cameras)
         result = json.loads((folder / "mapping.json").read_text(encoding="utf-8"))
         return cast(MappingResult, {**result, "plan": plan.name})
 

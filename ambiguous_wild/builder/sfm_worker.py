@@ -27,9 +27,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ambiguous_wild.builder.bundle_adjustment import pipeline_options
 from ambiguous_wild.builder.fixed_to_camera import FIXED, FixedArea, find_fixed, moving_matches
-from ambiguous_wild.builder.mapping import run_mapping
+from ambiguous_wild.builder.mapping import run_mapping, triangulate_known
 from ambiguous_wild.builder.matched import Matched, largest_component
 from ambiguous_wild.builder.records import FixedMask
 from ambiguous_wild.builder.retrieval import (
@@ -296,17 +295,8 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
 
 def run_triangulation(job: TriangulationJob) -> None:
     """Triangulate points from the inliers of the poses; poses and intrinsics do not change."""
-    posed = pycolmap.Reconstruction(job["model"])
-    matched = Matched.read(Path(job["database"]))
-    matched.take_cameras(posed)
-    matched.write_verified(Path(job["database"]), matched.verified_pairs(matched.poses(posed)))
-    triangulated = pycolmap.triangulate_points(
-        posed,
-        job["database"],
-        job["photos"],
-        job["output"],
-        options=pipeline_options(job["seed"]),
-        refine_intrinsics=False,
+    triangulated = triangulate_known(
+        Path(job["database"]), Path(job["model"]), job["photos"], Path(job["output"]), job["seed"]
     )
     triangulated.write_binary(job["output"])
 

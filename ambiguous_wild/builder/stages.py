@@ -20,6 +20,7 @@ from ambiguous_wild.builder.keep_masks import (
     mask_hashes,
     mask_warnings,
 )
+from ambiguous_wild.builder.known_poses import read_known_cameras
 from ambiguous_wild.builder.map_drawing import draw_built
 from ambiguous_wild.builder.moving_features import write_motion
 from ambiguous_wild.builder.pose_hypothesis import TWO_POSES
@@ -49,6 +50,7 @@ from ambiguous_wild.builder.workspace import StageResult, Workspace, content_key
 from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.colmap_model import read_model
+from ambiguous_wild.io.colmap_records import ColmapModel
 from ambiguous_wild.io.files import own_json, sha256_file
 from ambiguous_wild.io.motion_points import FILE
 from ambiguous_wild.io.scene_folder import ALL_TRAINED, MAP, TEST_EVERY, read_list
@@ -263,6 +265,7 @@ class Stages:
         masks: StageResult[MaskResult] | None,
     ) -> SfmStages:
         attempts: list[SfmStages] = []
+        known = read_known_cameras(self.capture.truth, photos) if self.settings.mapper == "truth" else None
         for plan in plans(photos, self.settings):
             registered = max((attempt.registered for attempt in attempts), default=0)
             most = [attempt for attempt in attempts if attempt.registered == registered]
@@ -272,7 +275,7 @@ class Stages:
             if attempts:
                 self.bar.say(f"{registered} of {len(photos)} photos placed: trying harder")
             before = attempts[-1] if attempts else None
-            attempts.append(self._attempt(work, screened, photos, masks, plan, before))
+            attempts.append(self._attempt(work, screened, photos, masks, plan, before, known))
         # Of attempts that register as many photos reliably, the last is taken, which is the most precise.
         best = max(reversed(attempts), key=lambda a: (a.mapping.facts["reliable"], a.registered))
         sources, wanted = {photo.name: photo.source for photo in photos}, self.settings.part
@@ -310,10 +313,14 @@ class Stages:
         masks: StageResult[MaskResult] | None,
         plan: SfmPlan,
         before: SfmStages | None,
+        known: ColmapModel | None,
     ) -> SfmStages:
         settings = self.settings
         sfm = StructureFromMotion(photos, screened.folder / "photos", settings, plan, self.jobs, self.bar)
-        camera = choose_camera(photos, settings.camera)
+        if known is None:
+            camera = choose_camera(photos, settings.camera)
+        else:
+            camera = "single" if len(known.cameras) == 1 else "per-image"
         mask_folder = masks.folder / "masks" if masks else None
         features = work.run(
             "features",
@@ -331,9 +338,10 @@ class Stages:
         )  # fmt: skip
         mapping = work.run(
             "mapping",
-            [matches.key, settings.mapper, settings.part, to_plain(plan), settings.seed],
-            lambda f: sfm.map(f, matches.folder, matches.facts["connected"]),
-        )
+            [matches.key, settings.mapper, settings.part, to_plain(plan), settings.seed,
+             *([self.inputs["truth"]] if known is not None else [])],
+            lambda f: sfm.map(f, matches.folder, matches.facts["connected"], known),
+        )  # fmt: skip
         return SfmStages(features, matches, mapping)
 
 

@@ -23,19 +23,24 @@ from ambiguous_wild.cli.run_progress import finish
 from ambiguous_wild.cli.study_file import Recorded, StudyFile, is_plan, read_study, typed_in
 from ambiguous_wild.core.config import check_limits, with_options
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.harness.benchmark import Engine, bench
+from ambiguous_wild.harness.benchmark import Engine, bench, find_methods
 from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
+    from ambiguous_wild.datasets.suites import Suite
     from ambiguous_wild.report.suite import PreparedSuite
 
-SUITES = ("ambiguous-wild", "on-the-go", "robustnerf", "photo-tourism", "drone")
+SUITES = (
+    "aw-sim", "aw-sim-mini", "aw-sim-large", "ambiguous-wild", "on-the-go", "robustnerf", "photo-tourism", "drone",
+)  # fmt: skip
+DATASETS = Path("datasets")  # where 'aw fetch' puts them
 # Settings that are given by --set, and the range of each; None: its type says all.
 RARE: dict[str, dict[str, Any]] = {
     "train": {"probes": (0, 100), "checkpoint_every_s": (0.01, math.inf), "on_nonfinite": None},
     "engine": {"retries": (0, 1000), "cpus_per_cell": (1e-4, math.inf), "gpus_per_cell": (0, math.inf),
                "memory_per_cell": (0, math.inf), "transfer": None, "transfer_limit": (0.001, math.inf)},
 }  # fmt: skip
+_NO_TRUTH = "exact poses are known of simulated suites alone: --suite aw-sim"
 LONGEST_S = 366 * 24 * 3600.0
 _UNITS = {"s": 1, "sec": 1, "second": 1, "m": 60, "min": 60, "minute": 60, "h": 3600, "hour": 3600}
 
@@ -72,13 +77,21 @@ def parse_budget(text: str) -> float:
     multiple=True,
     type=PathName(),
     help="A scene folder; repeatable. With --suite: a folder with one folder per scene, in any layout of "
-    "'aw import'.",
+    "'aw import'; of a simulated suite where it lies or is made.  [default for these: datasets/SUITE]",
 )
 @click.option(
     "--suite",
     "suite_name",
     type=click.Choice(SUITES),
-    help="All scenes of a published table; prints it beside the reported numbers.",
+    help="All scenes of a published table, printed beside the reported numbers; or of a suite that is simulated "
+    "here (aw-sim...), printed beside the leaderboard.",
+)
+@click.option(
+    "--poses",
+    type=click.Choice(["estimated", "truth"]),
+    default="estimated",
+    show_default=True,
+    help="Of a simulated suite; truth: exact poses, so that masks are judged without structure from motion.",
 )
 @training_options
 @click.option(
@@ -151,6 +164,7 @@ def command(
     methods: tuple[str, ...],
     scenes: tuple[Path, ...],
     suite_name: str | None,
+    poses: str,
     iterations: int | None,
     budgets: tuple[str, ...],
     resolution: str,
@@ -171,6 +185,7 @@ def command(
     aw bench --method refinesplat --scene scene --budget 10m --set refinesplat.mask_every=8
     aw bench --method 3dgs,refinesplat --scene scene --budget 1m --budget 3m --budget 10m -o runs
     aw bench --method 3dgs,robustsplat --mask refinesplat --scene scene -o runs
+    aw bench --suite aw-sim --method mine.py:mine -o runs
     aw bench --suite on-the-go --scene datasets/on-the-go -o runs
 
     STUDY is a file with options by their names, as every command writes it into the folder of its runs
@@ -211,15 +226,22 @@ def command(
     prepared = None
     if suite_name is not None:
         from ambiguous_wild.datasets.suites import get_suite
-        from ambiguous_wild.report.suite import prepare_suite, suite_methods
+        from ambiguous_wild.report.suite import suite_methods
 
-        if len(scenes) != 1:
-            raise AwError(f"--suite {suite_name} takes its scenes from one folder: give --scene DIR once")
         suite = get_suite(suite_name)
-        prepared = prepare_suite(suite, scenes[0], output, say=say)
-        scenes, protocol = tuple(prepared.scenes.values()), protocol or suite.protocol
         methods = methods or tuple(suite_methods(suite))
+        root = _suite_folder(suite, scenes)
+        recorded["scenes"] = (root,)
+        if suite.simulated is None:
+            prepared = _imported(suite, root, poses, output)
+        else:
+            find_methods(methods, given["plugins"], {}, 1)  # before minutes of simulation
+            prepared = _made(suite, root, poses, output)
+        scenes = tuple(prepared.scenes.values())
+        protocol = protocol or (suite.protocol if suite.simulated is None else None)
         iterations = iterations if iterations is not None or seconds else suite.iterations
+    elif poses != "estimated":
+        raise AwError(f"--poses {poses}: {_NO_TRUTH}")
     for flag, names in (("--method", methods), ("--scene", scenes)):
         if not names:
             raise AwError(f"{flag} is missing: 'aw bench --help' shows examples")
@@ -245,7 +267,7 @@ def command(
     )
     if prepared is not None and not as_json:
         for folder in report.folders:
-            _print_tables(prepared, folder)
+            _print_tables(prepared, folder, given["factor"])
     finish(report, as_json)
 
 
@@ -298,13 +320,47 @@ def plan_among(effects: Sequence[str]) -> tuple[list[str], Path | None]:
     return wanted, Path(plans[0]) if plans else None
 
 
-def _print_tables(prepared: PreparedSuite, folder: Path) -> None:
+def _suite_folder(suite: Suite, scenes: Sequence[Path]) -> Path:
+    """Return the folder of the suite's scenes: of a simulated one there is a default."""
+    if len(scenes) == 1:
+        return scenes[0]
+    if suite.simulated is None:
+        raise AwError(f"--suite {suite.name} takes its scenes from one folder: give --scene DIR once")
+    if scenes:
+        raise AwError(f"--suite {suite.name} lies in one folder: give --scene DIR once, or not at all")
+    return DATASETS / suite.dataset
+
+
+def _imported(suite: Suite, root: Path, poses: str, output: Path) -> PreparedSuite:
+    from ambiguous_wild.report.suite import prepare_suite
+
+    if poses != "estimated":
+        raise AwError(f"--poses {poses} with --suite {suite.name}: {_NO_TRUTH}")
+    return prepare_suite(suite, root, output, say=say)
+
+
+def _made(suite: Suite, root: Path, poses: str, output: Path) -> PreparedSuite:
+    from ambiguous_wild.cli.build_scene import kernels_meanwhile
+    from ambiguous_wild.io.files import check_output
+    from ambiguous_wild.report.simulated_suite import prepare_simulated
+
+    check_output(output / "run", outside={f"the suite {suite.name}": root})
+    with kernels_meanwhile():
+        return prepare_simulated(suite, root, exact_poses=poses == "truth", progress=True, say=say)
+
+
+def _print_tables(prepared: PreparedSuite, folder: Path, factor: int | None) -> None:
     from ambiguous_wild.report.plain_formats import to_text
-    from ambiguous_wild.report.suite import suite_tables
 
     try:
-        click.echo(
-            to_text(suite_tables(prepared, folder), color=sys.stdout.isatty(), width=line_width()), nl=False
-        )
-    except AwError as error:  # every run failed, which `finish` reports
+        if prepared.suite.simulated is not None:
+            from ambiguous_wild.report.suite_board import find_board, suite_board
+
+            tables = suite_board(prepared, folder, factor=factor, board=find_board())
+        else:
+            from ambiguous_wild.report.suite import suite_tables
+
+            tables = suite_tables(prepared, folder)
+        click.echo(to_text(tables, color=sys.stdout.isatty(), width=line_width()), nl=False)
+    except AwError as error:  # every run failed, which `finish` reports; or the board is damaged
         say(str(error))

@@ -85,10 +85,11 @@ def _compiled() -> bool:
 )
 @click.option(
     "--mapper",
-    type=click.Choice(["incremental", "global"]),
+    type=click.Choice(["incremental", "global", "truth"]),
     default="incremental",
     show_default=True,
-    help="COLMAP's mapper; global is faster on many photos, weaker on few.",
+    help="COLMAP's mapper; global is faster on many photos, weaker on few. truth: no mapper, the exact cameras of "
+    "a simulated capture.",
 )
 @click.option(
     "--part", type=int, default=1, show_default=True, help="Part to build, if photos fall into several."

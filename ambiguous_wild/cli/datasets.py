@@ -18,11 +18,13 @@ from ambiguous_wild.cli.options import (
     seed_option,
     threads_option,
 )
-from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.machine import usable_cores
 from ambiguous_wild.io.terminal import say
 
 if TYPE_CHECKING:
+    from ambiguous_wild.datasets.capture_hashes import VerifiedCaptures
+    from ambiguous_wild.datasets.suites import Suite
     from ambiguous_wild.datasets.write import ImportRecord
 
 KINDS = (
@@ -115,15 +117,28 @@ def summary(info: ImportRecord, why: str) -> list[str]:
 def fetch_command(name: str | None, output: Path, as_json: bool) -> None:
     """Download the dataset NAME and unpack it; without NAME, list the datasets: licence, size, page.
 
-    An interrupted download continues. The hash of the first download is stored in
+    A suite of simulated captures (aw-sim) is not downloaded but simulated, into OUTPUT/NAME/captures.
+
+    An interrupted call continues. The hash of the first download is stored in
     OUTPUT/archives/downloads.json; later downloads must match it.
     """
     from ambiguous_wild.datasets.fetch import find_public, public_data
+    from ambiguous_wild.datasets.suites import simulated_suites
 
+    suites = simulated_suites()
     if name is None:
         if as_json:
-            click.echo(json.dumps([asdict(d) for d in public_data().values()], indent=2, ensure_ascii=False))
+            rows = [*map(asdict, public_data().values()), *map(asdict, suites.values())]
+            click.echo(json.dumps(rows, indent=2, ensure_ascii=False))
             return
+        for suite in suites.values():
+            say(
+                f"{suite.name:<29}  simulated here, nothing is downloaded, licence: {suite.license}", out=True
+            )
+            say(
+                f"{'':<29}  {counted(len(suite.scenes), 'capture')} with exact truth; docs/datasets.md",
+                out=True,
+            )
         for data in public_data().values():
             size = f"{data.size_mb} MB" if data.size_mb else "size not stated"
             how = f"layout {data.layout}, {size}" if data.url else "from its page only"
@@ -133,7 +148,10 @@ def fetch_command(name: str | None, output: Path, as_json: bool) -> None:
     from ambiguous_wild.cli.run_progress import ticking
     from ambiguous_wild.datasets.fetch import fetch
 
-    data = find_public(name)
+    if name in suites:
+        _simulate(suites[name], output, as_json)
+        return
+    data = find_public(name, suites)
     say(f"{data.name}: licence: {data.license} ({data.page})")
     with ticking(desc=name, unit="B", unit_scale=True, disable=True if as_json else None) as tick:
         done = fetch(data, output, tick=tick, say=say)
@@ -148,6 +166,21 @@ def fetch_command(name: str | None, output: Path, as_json: bool) -> None:
             f"unpacked into {done.folder}; next: aw import {shlex.quote(str(done.folder))}/SCENE -o SCENE",
             out=True,
         )
+
+
+def _simulate(suite: Suite, output: Path, as_json: bool) -> None:
+    from ambiguous_wild.datasets.capture_hashes import CAPTURES
+    from ambiguous_wild.report.simulated_suite import make_captures
+
+    root = output / suite.dataset
+    captures = make_captures(suite, root, progress=not as_json, say=say)
+    if as_json:
+        hashes = {capture.name: capture.sha256 for capture in captures}
+        click.echo(json.dumps({"folder": str(root), "sha256": hashes}, indent=2))
+        return
+    scene = "" if output == Path("datasets") else f" --scene {shlex.quote(str(root))}"
+    say(f"{root / CAPTURES}: {counted(len(captures), 'capture')}; look at NAME/truth/sheet.jpg", out=True)
+    say(f"next: aw bench --suite {suite.name}{scene} -o runs", out=True)
 
 
 @click.command("export-scene")
@@ -277,10 +310,17 @@ def package_command(
 @click.argument("package", type=PathName())
 @json_option
 def verify_command(package: Path, as_json: bool) -> None:
-    """Check PACKAGE, a folder of 'aw package' or one of its archives: every checksum, table and scene.
+    """Check PACKAGE, a folder of 'aw package' or one of its archives: every checksum, table and scene; or the
+    captures of a simulated suite (datasets/aw-sim), against the hashes that everybody should get.
 
     Nothing is trusted: hostile archives are refused. TMPDIR is the folder to unpack in.
     """
+    from ambiguous_wild.datasets.capture_hashes import suite_of_captures, verify_captures
+
+    suite = suite_of_captures(package)
+    if suite is not None:
+        _print_captures(package, verify_captures(package, suite), as_json)
+        return
     from ambiguous_wild.datasets.package_check import verify
 
     verified = verify(package)
@@ -291,3 +331,29 @@ def verify_command(package: Path, as_json: bool) -> None:
     for warning in verified.warnings:
         say(f"warning: {warning}", out=True)
     say(f"{package} is whole: {len(verified.scenes)} scenes, {verified.files} files", out=True)
+
+
+def _print_captures(folder: Path, found: VerifiedCaptures, as_json: bool) -> None:
+    """Print what is known of the captures of a suite.
+
+    Raises:
+        AwError: one is damaged.
+    """
+    if as_json:
+        hashes = {capture.name: capture.sha256 for capture in found.checked}
+        facts = {"absent": found.absent, "damaged": found.damaged, "warnings": found.lines}
+        click.echo(json.dumps({"listed": {found.width: hashes}, **facts}, indent=2, ensure_ascii=False))
+    else:
+        for line in found.lines:
+            say(line, out=True)
+        if found.absent:
+            say(f"absent: {shortlist(found.absent, 20)}; 'aw fetch {found.suite.name}' makes them", out=True)
+        same = sum(capture.sha256 == capture.listed for capture in found.checked)
+        say(
+            f"{folder}: {counted(len(found.checked), 'capture')} of {found.suite.name} whole, {same} as listed",
+            out=True,
+        )
+    if found.damaged:
+        raise AwError(
+            f"{counted(len(found.damaged), 'capture')} of {folder} cannot be used: {found.damaged[0]}"
+        )

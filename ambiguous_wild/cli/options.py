@@ -20,7 +20,7 @@ OPTION_SECTIONS: dict[str, tuple[str, ...]] = {
     "Most used": ("-o", "--method", "--scene", "--group", "--budget", "--iterations", "--seed", "--effects",
                   "--mask", "--jobs", "--overwrite", "--name", "--test-list", "--keep-masks"),
     "Structure from motion": ("--sfm", "--matcher", "--mapper", "--camera", "--max-features", "--part"),
-    "Training": ("--set", "--sweep", "--resolution", "--factor", "--max-gaussians", "--start", "--suite",
+    "Training": ("--set", "--sweep", "--resolution", "--factor", "--max-gaussians", "--start", "--suite", "--poses",
                  "--protocol", "--plugin", "--metric-file"),
     "Ray": ("--engine", "--address"),
 }  # fmt: skip

@@ -12,7 +12,7 @@ import re
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from http.client import HTTPException
@@ -59,15 +59,19 @@ def public_data() -> dict[str, PublicData]:
     return {row["name"]: PublicData(**{k: str(v) for k, v in row.items()}) for row in rows}
 
 
-def find_public(name: str) -> PublicData:
+def find_public(name: str, others: Iterable[str] = ()) -> PublicData:
     """Return the dataset of a name.
+
+    Args:
+        name: its name.
+        others: names that are no downloads, for the message on a misspelt one.
 
     Raises:
         AwError: there is none, or it has no archive to download.
     """
     catalogue = public_data()
     if name not in catalogue:
-        raise unknown("dataset", name, catalogue, "'aw fetch' lists them")
+        raise unknown("dataset", name, [*others, *catalogue], "'aw fetch' lists them")
     if not catalogue[name].url:
         raise AwError(
             f"{name} has no fixed archive: download it from {catalogue[name].page}, then 'aw import' it"

@@ -18,18 +18,28 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ambiguous_wild.builder.progress import Bar
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.names import check_name, csv_text
 from ambiguous_wild.core.scene import SceneInfo
 from ambiguous_wild.datasets.privacy import may_show_person, strip_metadata
-from ambiguous_wild.datasets.release_facts import PackedFile, ReleaseInfo, SceneFacts, card, croissant
-from ambiguous_wild.io.files import atomic_dir, check_output, check_replaceable, write_json
+from ambiguous_wild.datasets.release_facts import (
+    PackedFile,
+    ReleaseInfo,
+    SceneFacts,
+    card,
+    croissant,
+    simulated_license,
+    with_simulated,
+)
+from ambiguous_wild.io.files import atomic_dir, check_output, check_replaceable, own_json, write_json
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, without_suffix
 
 FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")
 PHOTOS = ("scene", "photo", "split", "source", "done", "metadata_removed", "person")
 FIXED = ("README.md", "croissant.json", "files.csv", "photos.csv", "checksums.sha256", "checksums.md5")
 _TIME = (1980, 1, 1, 0, 0, 0)  # the earliest time that zip can hold
+NOT_STATED = "not stated"  # the licence in scene.json
 _DROPPED = ("seconds", "capture")  # keys of scene.json that differ between two builds of one scene
 _PHOTO_KINDS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic")
 
@@ -61,7 +71,7 @@ def package_scenes(
     Args:
         scenes: scene folders with scene.json.
         output: the folder to make; an earlier package in it is replaced.
-        info: licence, consent and the rest.
+        info: licence, consent and the rest; of simulated scenes they are known.
         keep_metadata: leave EXIF with places and serial numbers in the photos.
         look_for_people: run the person detectors of `privacy`.
         jobs: threads.
@@ -75,6 +85,8 @@ def package_scenes(
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise AwError(f"two scenes are called {twice[0]}: their archives would be one file; rename one")
+    captures = {name: own_json(root / "truth" / "capture.json") for root, name, _ in opened}
+    info = with_simulated(info, captures)
     check_output(output, outside={f"the scene {name}": root for root, name, _ in opened})
     ours = (output / "croissant.json").is_file()
     check_replaceable(output, "package", {*FIXED, *(p.name for p in output.glob("*.zip"))} if ours else None)
@@ -96,7 +108,7 @@ def package_scenes(
             (folder / table).write_text(_csv(head, rows), encoding="utf-8")
             packed.append(_described(folder / table, "text/csv"))
         people = [f"{r[0]}/{r[1]}" for r in photo_rows if r[6]] if look_for_people else None
-        facts = [_facts(name, scene_info) for _, name, scene_info in opened]
+        facts = [_facts(name, scene_info, captures[name]) for _, name, scene_info in opened]
         data = croissant(info, facts, packed, {"files.csv": FILES, "photos.csv": PHOTOS})
         write_json(folder / "croissant.json", data)
         (folder / "README.md").write_text(card(info, facts, people, stripped, keep_metadata), "utf-8")
@@ -208,11 +220,12 @@ def _role(path: str) -> str:
     return roles.get(top, "list" if path.endswith(".txt") else "record")
 
 
-def _facts(name: str, info: SceneInfo) -> SceneFacts:
+def _facts(name: str, info: SceneInfo, capture: Facts) -> SceneFacts:
     counts, ambiguity = info.get("counts"), info.get("ambiguity")
+    license = str(info.get("license", NOT_STATED))
     return {
         "name": name,
-        "license": str(info.get("license", "not stated")),
+        "license": license if license != NOT_STATED else simulated_license(capture) or license,
         "counts": counts if isinstance(counts, dict) else {},
         "factor": info["factor"],
         "ambiguity": ambiguity if isinstance(ambiguity, dict) else None,

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import sqlite3
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from ambiguous_wild.builder.known_poses import set_cameras
 from ambiguous_wild.builder.moving_features import write_motion
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import MotionResult, ScreenedPhoto
@@ -26,9 +25,8 @@ from ambiguous_wild.builder.sfm import (
 )
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.scene import Split, near_others
-from ambiguous_wild.io.colmap_model import read_model, write_model
+from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import (
-    MODELS,
     ColmapModel,
     ModelImage,
     ModelPoints,
@@ -209,30 +207,6 @@ def _match_posed(
     plan = replace(plans(used_photos, settings)[0], max_features=settings.max_features)
     attempt = StructureFromMotion(used_photos, photos, settings, plan, jobs, bar)
     attempt.extract_features(folder / "features", camera)
-    _set_cameras(folder / "features" / DATABASE, folder / "known", model, used)
+    set_cameras(folder / "features" / DATABASE, folder / "known", model, used)
     attempt.match(folder / "matches", folder / "features", posed=True)
     return folder / "matches" / DATABASE
-
-
-def _set_cameras(database: Path, known: Path, model: ColmapModel, used: Mapping[str, ModelImage]) -> None:
-    """Write the known cameras to the database, and the model with the database's ids to `known`."""
-    with closing(sqlite3.connect(database)) as db, db:
-        rows = db.execute("SELECT name, image_id, camera_id FROM images").fetchall()
-        sizes = {n: (w, h) for n, w, h in db.execute("SELECT camera_id, width, height FROM cameras")}
-        cameras, images = {}, {}
-        for name, image_id, camera_id in rows:
-            camera = model.cameras[used[name].camera_id]
-            if sizes[camera_id] != (camera.width, camera.height):
-                raise AwError(
-                    f"{name} is {sizes[camera_id][0]}x{sizes[camera_id][1]}, its camera {camera.width}x"
-                    f"{camera.height}: points cannot be triangulated; use the photos that the poses belong to"
-                )
-            cameras[camera_id] = dataclasses.replace(camera, camera_id=camera_id)
-            images[image_id] = dataclasses.replace(used[name], image_id=image_id, camera_id=camera_id)
-        for camera in cameras.values():
-            params = np.array(camera.params, "<f8").tobytes()
-            db.execute(
-                "UPDATE cameras SET model = ?, params = ?, prior_focal_length = 1 WHERE camera_id = ?",
-                (MODELS[camera.model][0], params, camera.camera_id),
-            )
-    write_model(known, ColmapModel(cameras, images, points_without_tracks()))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TypedDict
 
-from ambiguous_wild.core.config import from_plain
+from ambiguous_wild.core.config import Facts, from_plain
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.privacy import HOW_WEAK
 from ambiguous_wild.io.plain_yaml import read_mapping
@@ -38,6 +38,7 @@ CONTEXT = {term: _OTHER_TERMS.get(term, f"cr:{term}") for term in _TERMS.split()
 NOT_FOR_RELEASE = "NOT FOR RELEASE"
 _TYPES = {"bytes": "sc:Integer"}
 REQUIRED = ("title", "description", "creators", "license", "consent", "contact")
+SIMULATED_LICENSE = "CC0-1.0"  # of what 'aw simulate' makes
 TEMPLATE = """\
 # About the release. The first six must be filled; without them the package says "not for release".
 title: ""
@@ -89,6 +90,32 @@ class ReleaseInfo:
             if re.fullmatch(r"[\w.+-]+", self.license)
             else ""
         )
+
+
+def with_simulated(info: ReleaseInfo, scenes: Mapping[str, Facts]) -> ReleaseInfo:
+    """Return the facts with what is known, and not stated otherwise, of scenes that are all simulated.
+
+    Args:
+        info: what a person stated.
+        scenes: name -> truth/capture.json; empty where a scene is not simulated.
+    """
+    if not all(simulated_license(capture) for capture in scenes.values()):
+        return info
+    known = {
+        "title": f"Simulated scenes: {shortlist(scenes, 20)}",
+        "description": "Ray-cast captures with distractors, clean test photos and exact truth",
+        "creators": ("ambiguous-wild",),
+        "license": SIMULATED_LICENSE,
+        "consent": "not needed: simulated, no people, no personal data",
+        "contact": "not needed: no photo shows a person",
+    }
+    return replace(info, **{key: value for key, value in known.items() if not getattr(info, key)})  # type: ignore[arg-type]
+
+
+def simulated_license(capture: Facts) -> str:
+    """Return the licence of a simulated capture, by its truth/capture.json; empty if it is none."""
+    stated = capture.get("licence")
+    return SIMULATED_LICENSE if isinstance(stated, str) and stated.startswith("CC0") else ""
 
 
 def read_release_info(path: Path) -> ReleaseInfo:

@@ -1,12 +1,12 @@
-"""Suites: the scenes of published tables, their folders, and how they are measured."""
+"""Suites: scenes of published tables, and simulated ones; their folders, and how they are measured."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ambiguous_wild.core.errors import AwError, shortlist, unknown
 from ambiguous_wild.datasets.foreign import plain
@@ -14,6 +14,14 @@ from ambiguous_wild.io.plain_yaml import read_mapping
 
 FILE = Path(__file__).with_name("suites.yaml")
 SLACK = 0.1  # undistorting crops a photo by less than this
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """How `aw simulate` makes the captures of a suite; a scene's name is that of its preset."""
+
+    width: int  # px, of a photo
+    seed: int  # of worlds, walks and distractors
 
 
 @dataclass(frozen=True)
@@ -30,6 +38,7 @@ class Suite:
     license: str
     width: int = 0  # px, longer side of the photos; 0 = not stated
     height: int = 0
+    simulated: Simulated | None = None  # None: the photos are real
 
     @property
     def scenes(self) -> list[str]:
@@ -49,7 +58,17 @@ def scene_id(scene: str) -> str:
 @cache
 def suites() -> dict[str, Suite]:
     """Read all suites, by name."""
-    return {row["name"]: Suite(**row) for row in read_mapping(FILE)["suites"]}
+    return {row["name"]: _suite(row) for row in read_mapping(FILE)["suites"]}
+
+
+def _suite(row: Mapping[str, Any]) -> Suite:
+    made = row.get("simulated")
+    return Suite(**{**row, "simulated": Simulated(**made) if made else None})
+
+
+def simulated_suites() -> dict[str, Suite]:
+    """Return the suites whose captures are simulated, by name."""
+    return {name: suite for name, suite in suites().items() if suite.simulated is not None}
 
 
 def get_suite(name: str) -> Suite:
@@ -144,3 +163,19 @@ def differences(suite: Suite, scene: str, sizes: Sequence[tuple[int, int]], fact
             names = shortlist(dict.fromkeys(odd), 3)
             notes.append(f"photos of {names} px; {suite.dataset} has {suite.width}x{suite.height}")
     return notes
+
+
+def simulated_dataset(capture: Mapping[str, Any], factor: object) -> str | None:
+    """Return the dataset of a simulated suite that a scene belongs to; None where it is of none.
+
+    Args:
+        capture: truth/capture.json.
+        factor: downsampling of the scene.
+    """
+    spec = capture.get("spec")
+    width = spec.get("width") if isinstance(spec, dict) else None
+    for suite in suites().values():
+        made, known = suite.simulated, capture.get("preset") in suite.scenes
+        if made and known and (made.width, made.seed, suite.factor) == (width, capture.get("seed"), factor):
+            return suite.dataset
+    return None

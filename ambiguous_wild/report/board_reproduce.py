@@ -14,6 +14,7 @@ from pathlib import Path
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain
+from ambiguous_wild.datasets.suites import simulated_dataset
 from ambiguous_wild.harness.command_lines import option_text
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
 from ambiguous_wild.harness.trained_models import Opened, open_scene
@@ -30,6 +31,7 @@ FLAGS = ("camera", "matcher", "mapper", "max_features", "seed", "masks_missing",
 _PLUGIN = re.compile(r"[\w.-]+\.py")
 _REFERENCE = re.compile(rf"({_PLUGIN.pattern}:\w+|external:[\w.-]+|nerfbaselines:[\w.-]+)([@+][\w@+=,.-]+)?")
 SIMULATED = "simulated"
+EXACT_POSES = ", exact poses"  # ends the name of a dataset whose poses are not estimated
 
 
 def setting(config: RunConfig, planned: bool = False) -> str:
@@ -53,6 +55,11 @@ def setting(config: RunConfig, planned: bool = False) -> str:
     if train.get("max_gaussians") is not None:
         words.append(f"at most {train['max_gaussians']} Gaussians")
     return ", ".join(words)
+
+
+def dataset_of(name: str, exact_poses: bool) -> str:
+    """Return the name under which runs are on the board: those with exact poses are apart from all others."""
+    return name + EXACT_POSES if exact_poses and not name.endswith(EXACT_POSES) else name
 
 
 def _length(train: TrainRecord) -> str:
@@ -250,6 +257,21 @@ def _build(raw: str, name: str, settings: Facts) -> list[str]:
     return words + (["--strict"] if settings.get("strict") else [])
 
 
+def _stated(scene: Scene) -> str:
+    """Return the dataset by scene.json, or that of a simulated scene; empty where none is known."""
+    name, truth = scene.info.get("dataset"), own_json(scene.root / "truth" / "capture.json")
+    if isinstance(name, str) and name.strip():
+        return name
+    if not isinstance(truth.get("preset"), str):
+        return ""
+    return simulated_dataset(truth, scene.info.get("factor")) or SIMULATED
+
+
+def _has_exact_poses(scene: Scene) -> bool:
+    chosen = dict(scene.info).get("chosen")
+    return isinstance(chosen, dict) and chosen.get("mapper") == "truth"
+
+
 class Scenes:
     """Find the scenes of runs; each is opened once."""
 
@@ -289,19 +311,16 @@ class Scenes:
         return Path(path) if isinstance(path, str) and path and Path(path).is_dir() else None
 
     def dataset(self, run: Path, scene: Scene | None, scene_hash: str) -> str:
-        """Return the dataset: the given one, that in scene.json, "simulated", or that on the board.
+        """Return the dataset: the given one, that in scene.json, of simulated scenes, or that on the board.
+
+        Scenes with exact poses are in one of their own, see `dataset_of`.
 
         Raises:
             AwError: none of these is available.
         """
-        if self._dataset is not None:
-            return self._dataset
-        if scene is not None:
-            name = scene.info.get("dataset")
-            if isinstance(name, str) and name.strip():
-                return name
-            if isinstance(own_json(scene.root / "truth" / "capture.json").get("preset"), str):
-                return SIMULATED
+        known = self._dataset or (_stated(scene) if scene is not None else "")
+        if known:
+            return dataset_of(known, scene is not None and _has_exact_poses(scene))
         if scene_hash in self._datasets:
             return self._datasets[scene_hash]
         why = "its scene is not on this machine" if scene is None else f"{scene.root} names none"

@@ -174,9 +174,9 @@ def _config(run: Path) -> RunConfig:
 
 def _words(run: Path, config: RunConfig, before: list[str], recorded: str) -> tuple[str, str]:
     """Return (setting, commands) of a configuration, which a stranger may have written."""
-    planned = _planned(run, config)
+    by_plan = _by_plan(run, config)
     try:
-        words = check_text(f"setting of {run}", setting(config, planned))
+        words = check_text(f"setting of {run}", setting(config, by_plan))
         return words, command(config, before, recorded)
     except AwError as error:
         raise AwError(f"{run}: {error}") from None
@@ -184,10 +184,15 @@ def _words(run: Path, config: RunConfig, before: list[str], recorded: str) -> tu
         raise AwError(f"{run / 'config.yaml'} was not written by 'aw bench' ({error}): {RESTORE}") from None
 
 
-def _planned(run: Path, config: RunConfig) -> bool:
+def _by_plan(run: Path, config: RunConfig) -> bool:
     """Return whether the plan of the scene chose the run's effects."""
     if config.get("effects") and not (run / EFFECTS).is_file():
         _partial(run, f"it lacks {EFFECTS}, which says who chose its effects")
+    return chosen_by_plan(run)
+
+
+def chosen_by_plan(run: Path) -> bool:
+    """Return whether the plan of the scene chose the run's effects."""
     return bool(own_json(run / EFFECTS).get("asked") == "auto")
 
 

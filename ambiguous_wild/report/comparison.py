@@ -98,7 +98,7 @@ def comparison(
         Table(
             scene or title,
             tuple(Column("", measure, scene, doubtful=measure.key in doubtful) for measure in columns),
-            tuple(_ranked(of, columns, unranked | doubtful | (quality if scene in apart else frozenset()))),
+            tuple(ranked(of, columns, unranked | doubtful | (quality if scene in apart else frozenset()))),
             continued=True,
         )
         for scene, of in rows.items()
@@ -313,7 +313,7 @@ def _mean_row(
     return Row(method, tuple(cells), runs=sum(row.runs for row in rows), ranked=not why, note=why)
 
 
-def _ranked(rows: Sequence[Row], columns: tuple[Measure, ...], unranked: frozenset[str]) -> list[Row]:
+def ranked(rows: Sequence[Row], columns: tuple[Measure, ...], unranked: frozenset[str]) -> list[Row]:
     """Mark the first, second and third of every column, except in the `unranked` columns."""
     marked = [list(row.cells) for row in rows]
     for i, column in enumerate(columns):

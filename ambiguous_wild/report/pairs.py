@@ -223,14 +223,15 @@ def _pair(
     if measure.per_image:
         over_images = values.interval(measure.key, first, other, list(own))
         both = [pair for scene in own if (pair := values.on(scene, measure.key, first, other)) is not None]
-        on_images = _counts([d for a, b in both for d in a.mean(axis=1) - b.mean(axis=1)], measure)
-    on_scenes = _counts(list(own.values()), measure)
+        on_images = counts_of([d for a, b in both for d in a.mean(axis=1) - b.mean(axis=1)], measure)
+    on_scenes = counts_of(list(own.values()), measure)
     return MethodPair(
         first, other, measure, "ok", over_images, over_scenes, won_scenes=on_scenes, won_images=on_images
     )
 
 
-def _counts(differences: Sequence[float], measure: Measure) -> Counts:
+def counts_of(differences: Sequence[float], measure: Measure) -> Counts:
+    """Count how often a difference is for the first method, zero as printed, and against it."""
     sign = -1.0 if measure.better == "lower" else 1.0
     shown = [sign * round(d, measure.digits) for d in differences]
     return Counts(sum(d > 0 for d in shown), sum(d == 0 for d in shown), sum(d < 0 for d in shown))
@@ -270,11 +271,11 @@ def _texts(pair: MethodPair) -> list[str]:
         return [name, SHOWN[pair.state], "", "", "", ""]
     digits = pair.measure.digits
     counts = pair.won_scenes if pair.scenes.count > 1 else pair.won_images
-    over = [_between(interval, digits) for interval in (pair.images, pair.scenes)]
+    over = [interval_text(interval, digits) for interval in (pair.images, pair.scenes)]
     return [name, f"{pair.scenes.mean:+z.{digits}f}", *over, p_text(pair.p_holm), counts.text]
 
 
-def _between(interval: Interval, digits: int) -> str:
+def interval_text(interval: Interval, digits: int) -> str:
     """Return the interval; a dash where there are too few values for one."""
     if math.isnan(interval.low):
         return SHOWN["missing"]

@@ -25,6 +25,7 @@ class PreparedSuite:
     suite: Suite
     scenes: dict[str, Path]  # name in runs -> folder
     absent: tuple[str, ...]  # scenes of the table that were not found
+    exact_poses: bool = False  # by simulated cameras, not by structure from motion
 
 
 def prepare_suite(

@@ -170,7 +170,7 @@ def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
             s,
             tint=(s.tint[0] * tint[0], s.tint[1] * tint[1], s.tint[2] * tint[2])
             if s.texture == thing.texture
-            else s.tint,  # glass and tyres of a car
+            else s.tint,
             offset=s.offset if thing.kind == "board" else (s.offset[0] + shift[0], s.offset[1] + shift[1]),
         )
         for s in parts

@@ -27,7 +27,8 @@ from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.io.lens import Lens, make_lens
 from ambiguous_wild.io.photos import MIN_SIDE
 
-TRUTH_PARTS = ("distractor", "shadow", "clean")
+NUMBERED = ("instances", "objects")  # parts of the truth whose pixels are numbers
+TRUTH_PARTS = ("distractor", "shadow", *NUMBERED, "clean")
 MAX_LOST = 0.9  # share of the photo that is kept, below which a message says so
 FACTORS = (1, 2, 4, 8)
 TARGET_SIDE = 480  # px; literature trains at about 504 x 378
@@ -154,8 +155,16 @@ def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
     return downsample_photo(image, *size) if image.ndim == 3 else downsample_mask(image, *size)
 
 
+def _reduced_numbers(numbers: np.ndarray, factor: int) -> np.ndarray:
+    """Downsample numbers of objects [H, W] by a factor: the nearest, as a mean of numbers is none."""
+    size = downsampled_size(numbers.shape[1], numbers.shape[0], factor)
+    return numbers if factor == 1 else cv2.resize(numbers, size, interpolation=cv2.INTER_NEAREST)
+
+
 def _truth(folder: Path, lens: Lens, photo: ScreenedPhoto, truth: Path, factor: int) -> list[str]:
-    """Resample the truth of one photo: distractors and shadows like masks, the clean photo like the photo."""
+    """Resample the truth of one photo: the clean one like the photo, numbers by the nearest, the others
+    like masks.
+    """
     parts = PurePosixPath(photo.source).with_suffix("").parts
     original = "/".join(parts[parts[0] in ("train", "test", "images") :])
     written = []
@@ -171,6 +180,7 @@ def _truth(folder: Path, lens: Lens, photo: ScreenedPhoto, truth: Path, factor: 
                 "or make the capture again"
             )
         flat = lens.remap(pixels, nearest=part != "clean")
-        write_png(folder / "truth" / part / photo.name, _reduced(flat, factor))
+        reduced = _reduced_numbers(flat, factor) if part in NUMBERED else _reduced(flat, factor)
+        write_png(folder / "truth" / part / photo.name, reduced)
         written.append(part)
     return written

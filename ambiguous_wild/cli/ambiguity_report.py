@@ -45,7 +45,7 @@ from ambiguous_wild.io.terminal import say
     "--objects",
     type=PathName(file_okay=False),
     help="Folder of masks of the static objects to compare with, <stem>.png, white = object.  "
-    "[default: every static segment]",
+    "[default: statues, cars and pictures of a simulated capture, else every static segment]",
 )
 @click.option("--record/--no-record", default=True, show_default=True, help="Save the scores in scene.json.")
 @json_option

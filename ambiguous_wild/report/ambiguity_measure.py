@@ -13,7 +13,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.harness.sheets import evenly_spaced
-from ambiguous_wild.io.images import load_image_float
+from ambiguous_wild.io.images import load_image_float, read_gray
 from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.refinesplat.structure import GREY, correlation
 from ambiguous_wild.metrics import ambiguity as am
@@ -182,7 +182,8 @@ def measure(
         masks: masks of its distractors.
         background: the background behind them.
         features: name of a back end, see `vision.backends`.
-        objects: folder with masks of static objects to compare with, white = object; None: all segments.
+        objects: folder with masks of static objects to compare with, white = object; None: those of a simulated
+            capture, else all segments.
         progress: wraps the list of views, to show a bar.
 
     Raises:
@@ -197,6 +198,9 @@ def measure(
     backend = _fitted(scene, features)
     segments = GraphSegments()
     statistics = sem.ChannelStatistics()
+    exact = scene.root / "truth" / "objects"
+    numbered = objects is None and exact.is_dir()  # each object has a number, not all are white
+    objects = exact if numbered else objects
     named = _object_masks(objects, views) if objects is not None else None
     points = read_motion_points(scene.root)
     moving, static, every, scores, evidence = [], [], [], [], []
@@ -210,16 +214,20 @@ def measure(
         with torch.no_grad():
             grid = backend(torch.from_numpy(seen)).numpy()
         statistics.add(grid)
-        regions, _ = ndimage.label(hidden)
+        regions = _instances(scene, masks, view, hidden)
         whole = segments.labels(torch.from_numpy(seen))
         moving.append(sem.region_means(grid, regions, sem.MIN_SHARE))
         every.append(sem.region_means(grid, np.where(hidden, 0, whole), sem.MIN_SHARE))
         static.append(every[-1])
         if named is not None:
-            things = np.zeros(hidden.shape, bool)  # a photo without a mask has no objects
-            if view.name in named:
-                things = small_mask(features, load_mask(named[view.name], view)) & ~hidden
-            static[-1] = sem.region_means(grid, ndimage.label(things)[0], sem.MIN_SHARE)
+            things = np.zeros(hidden.shape, int)  # a photo without a mask has no objects
+            if view.name in named and numbered:
+                size = hidden.shape[1], hidden.shape[0]
+                things = cv2.resize(read_gray(named[view.name]), size, interpolation=cv2.INTER_NEAREST)
+            elif view.name in named:
+                white = small_mask(features, load_mask(named[view.name], view))
+                things = ndimage.label(white & ~hidden)[0]
+            static[-1] = sem.region_means(grid, np.where(hidden, 0, things), sem.MIN_SHARE)
         evidence.append(distractors(regions, photo, behind, known, whole, points.get(view.name)))
         scores.append((view.name, counts, np.histogram(residual, BINS)[0]))
     mean, whiten = statistics.whitening()
@@ -238,6 +246,17 @@ def measure(
         scene, masks, background, photos, features, backend, whitened, mean, whiten, moving, anchors, usual,
         named is not None,
     )  # fmt: skip
+
+
+def _instances(scene: Scene, masks: DistractorMasks, view: View, hidden: np.ndarray) -> np.ndarray:
+    """Label the distractors of a mask [h, w] bool: by the numbers of a simulated capture, else connected regions."""
+    from scipy import ndimage
+
+    path = scene.root / "truth" / "instances" / f"{stem(view)}.png"
+    if masks.source != "truth" or not path.is_file():
+        return np.asarray(ndimage.label(hidden)[0])
+    size = hidden.shape[1], hidden.shape[0]
+    return np.where(hidden, cv2.resize(read_gray(path), size, interpolation=cv2.INTER_NEAREST), 0)
 
 
 def _fitted(scene: Scene, spec: str) -> Any:

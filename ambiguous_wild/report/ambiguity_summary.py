@@ -22,7 +22,7 @@ LOOKS = (
     "counts as similar to it, and a red statue as different from a stone statue; --objects names the static "
     "objects to compare with, --features dinov2-small compares kinds of objects"
 )
-NAMED = "weight-free features compare looks, not meaning; compared with the objects of --objects"
+NAMED = "weight-free features compare looks, not meaning; compared with named objects"
 NO_DISTRACTORS = "no distractors"  # the class of a scene whose masks are empty
 REAL = "raw cosine, as in the paper"
 

@@ -4,9 +4,12 @@ RAW/train/IMG_0001.jpg ...        with distractors
 RAW/test/IMG_0101.jpg ...         other viewpoints, no distractors
 RAW/truth/cameras.json            name -> size, fx, fy, cx, cy, cam_from_world (OpenCV axes, metres)
 RAW/truth/distractor/<stem>.png   255 where any part of the pixel shows a distractor, else 0
+RAW/truth/instances/<stem>.png    0, or the number of the distractor in the spec, from 1; 255: fixed to the camera
 RAW/truth/clean/<stem>.png        the train photo without distractors, same effects, before JPEG
 RAW/truth/shadow/<stem>.png       with moving shadows or panes of glass: 255 where a shadow, or what a pane
                                   reflects, changes the static scene
+RAW/truth/objects/<stem>.png      0, or the number of the static object (statue, car, poster) in the middle of the
+                                  pixel, as if no distractor were there
 RAW/truth/depth/<stem>.png        optional: z of the static surface, 16 bit, millimetres
 RAW/truth/capture.json            spec, seed, versions, label; per photo occlusion, placed distractors and
                                   drawn effects; sha256 of every file
@@ -221,7 +224,7 @@ def simulate(
     with atomic_dir(out) as folder:
         shadow = ["truth/shadow"] if spec.has_shadows else []
         optional = [*shadow, *(["truth/depth"] if depth else [])]
-        for part in ("train", "test", "truth/distractor", "truth/clean", *optional):
+        for part in ("train", "test", "truth/distractor", "truth/instances", "truth/clean", "truth/objects", *optional):
             (folder / part).mkdir(parents=True)
         photos = _render(spec, world, planned, seed, folder, depth, progress)
         write_json(folder / "truth" / "cameras.json", {s.name: _camera_json(spec, s.camera) for s in planned})
@@ -248,7 +251,7 @@ def _render(
         number: int, prepared: PreparedPhoto, traced: TracedPhoto, metres: np.ndarray | None
     ) -> None:
         photo = planned[number]
-        rendered = finish_photo(photo, randoms[number], prepared, traced)
+        rendered = finish_photo(world, photo, randoms[number], prepared, traced)
         _write_photo(
             folder / photo.split / photo.name, rendered.photo, spec, photo.camera, number, rendered.effects
         )
@@ -346,7 +349,9 @@ def _truth(
     """Yield folder and pixels of every truth image of the photo."""
     if photo.split == "train":
         yield "distractor", np.where(rendered.owner > 0, 255, 0).astype(np.uint8)
+        yield "instances", rendered.owner
         yield "clean", rendered.clean
+        yield "objects", rendered.things
         if rendered.shadow is not None:
             yield "shadow", np.where(rendered.shadow, 255, 0).astype(np.uint8)
     if metres is not None:

@@ -107,5 +107,5 @@ def courtyard(rng: np.random.Generator, detail_px_per_m: float, samples: int, wh
     shapes = [*_walls(rng), *furniture]
     if what.statue:
         shapes += placed(parts_of("courtyard plinth"), (statue[0], statue[1], 0), yaw)
-        shapes += placed(figure("stone", "stone", 0.07, 0.8), statue, yaw)
+        shapes += placed(figure("stone", "stone", 0.07, 0.8), statue, yaw, thing="statue")
     return world_of(PLAN, what, shapes, circles, textures, d, sunlight(rng, samples), statue)

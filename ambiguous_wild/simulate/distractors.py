@@ -15,7 +15,7 @@ from ambiguous_wild.simulate.image_effects import specular
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID, INSTANTS
 from ambiguous_wild.simulate.shapes import Shape, barrier, figure, placed, shape_table
 from ambiguous_wild.simulate.spec import STATUES, CaptureSpec, Distractor, GroundPlan
-from ambiguous_wild.simulate.tracer import ShapeTable, covered_share, trace
+from ambiguous_wild.simulate.tracer import ShapeTable, first_hits
 from ambiguous_wild.simulate.world import World, car, parts_of, placard, statue
 
 _TRIES = 80  # layouts drawn for a photo, of which the best is taken
@@ -124,8 +124,6 @@ def lay_out(
     """
     chosen: list[tuple[DistractorPose, ...]] = []
     static = world.table()
-    light = replace(world.light, sun=np.ascontiguousarray(world.light.sun[:1]))  # one sample a pixel
-    nobody = shape_table((), world.atlas)
     low, high = spec.occlusion
     # The place of a walker is given, and choosing among layouts would change how often it is present.
     tries = 1 if all(d.path != "elsewhere" for d in spec.distractors) else _TRIES
@@ -144,10 +142,11 @@ def lay_out(
         if tries == 1:
             chosen.append(_draw(spec, camera, world, chosen, rng))
             continue
-        depth_m = trace(small, static, nobody, world.atlas, light).depth_m
+        _, depth_m = first_hits(small, static)
         for attempt in range(tries):
             layout = _draw(spec, camera, world, chosen, rng, present)
-            share = covered_share(small, depth_m, movers(spec, layout, world))
+            seen, _ = first_hits(small, movers(spec, layout, world), depth_m)
+            share = float(np.mean(seen >= 0))
             tolerance = (high - low) * (0.1 + 0.4 * attempt / tries)
             gap = max(abs(share - aim) - tolerance, 0.0) + 10 * max(low - share, share - high, 0.0)
             if gap < best_gap:

@@ -26,7 +26,7 @@ from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.kernels import DOME
 from ambiguous_wild.simulate.shapes import Shape, shape_table
 from ambiguous_wild.simulate.spec import CaptureSpec, Effects, FixedThing
-from ambiguous_wild.simulate.tracer import Light, ShapeTable, TracedPhoto, build_atlas, trace
+from ambiguous_wild.simulate.tracer import Light, ShapeTable, TracedPhoto, build_atlas, first_hits, trace
 from ambiguous_wild.simulate.truth_records import DrawnEffects
 from ambiguous_wild.simulate.world import World
 
@@ -54,6 +54,7 @@ class RenderedPhoto:
     clean: np.ndarray  # [H, W, 3] uint8, without distractors and moving shadow, before JPEG
     owner: np.ndarray  # [H, W] uint8: number of the first distractor in the pixel, 0 = none; or `FIXED`
     shadow: np.ndarray | None  # [H, W] bool, as in `TracedPhoto`
+    things: np.ndarray  # [H, W] uint8: number of the static object in the middle of the pixel, 0 = none
     effects: DrawnEffects
 
 
@@ -108,7 +109,7 @@ def trace_photo(world: World, prepared: PreparedPhoto) -> TracedPhoto:
 
 
 def finish_photo(
-    planned: PlannedPhoto, random: PhotoRandom, prepared: PreparedPhoto, traced: TracedPhoto
+    world: World, planned: PlannedPhoto, random: PhotoRandom, prepared: PreparedPhoto, traced: TracedPhoto
 ) -> RenderedPhoto:
     """Do the steps after the rays are traced."""
     effects, drawn = prepared.effects, prepared.drawn
@@ -123,7 +124,21 @@ def finish_photo(
         quality = fx.draw_jpeg(effects.jpeg, random)
         pixels = fx.jpeg(pixels, quality)
         drawn["jpeg"] = {"quality": quality}
-    return RenderedPhoto(pixels, clean_pixels, owner, shadow, drawn)
+    return RenderedPhoto(pixels, clean_pixels, owner, shadow, _things(world, prepared, planned.camera), drawn)
+
+
+def _things(world: World, prepared: PreparedPhoto, camera: Camera) -> np.ndarray:
+    """Return the number of the static object in each pixel, [H, W] uint8, as if no distractor were there."""
+    which, _ = first_hits(prepared.camera, prepared.scene.static)
+    names = sorted({s.thing for s in world.shapes})
+    numbers = np.array([names.index(s.thing) if s.thing else 0 for s in world.shapes], np.uint8)
+    labels = np.where(which >= 0, numbers[which], 0).astype(np.uint8)
+    if prepared.move is None:
+        return labels
+    moved = np.zeros((camera.height, camera.width), np.uint8)
+    for number in (int(n) for n in np.unique(labels) if n):
+        moved[prepared.move((labels == number).astype(np.float32)) >= 0.5] = number
+    return moved
 
 
 def depth_m(world: World, camera: Camera) -> np.ndarray:
@@ -138,6 +153,7 @@ def compile_tracer() -> None:
     nothing, black = shape_table((), atlas), np.zeros(3)
     camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))
     trace(camera, nothing, nothing, atlas, Light(np.ones((1, 3)), black, black, black))
+    first_hits(camera, nothing)
 
 
 def _lasting(effects: Effects) -> Effects:

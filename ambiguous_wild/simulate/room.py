@@ -61,7 +61,8 @@ def room(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
     }
     shapes = [*_hull(), *_pictures(streams[4]), *shapes]
     if what.statue:
-        pedestal = [*parts_of("room pedestal"), *placed([statue("bust", "stone", 0.75)], (0, 0, 0.87), 0.0)]
+        bust = placed([statue("bust", "stone", 0.75)], (0, 0, 0.87), 0.0, thing="statue")
+        pedestal = [*parts_of("room pedestal"), *bust]
         shapes += placed(pedestal, hub, float(rng.uniform(-20, 20)))
     # The sun comes in through the windows; light reflected by walls is part of the sky light.
     light = sunlight(rng, samples, (-178.0, -165.0), (26.0, 34.0), sky=1.4)

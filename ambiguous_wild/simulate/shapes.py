@@ -160,6 +160,7 @@ class Shape:
     casts: bool = True
     owner: int = 0  # 0: the static world, k: the k-th distractor, UNSEEN
     instant: int = ALWAYS  # of the exposure at which it is there
+    thing: str = ""  # name of the static object that a distractor may be taken for; empty: part of the place
     gloss: tuple[float, float] = (0.0, 0.0)  # strength and sharpness of the highlight
     volume: str = ""  # name of the statue, for VOLUME
 

@@ -213,19 +213,31 @@ def trace(
     return TracedPhoto(clean, distracted, changed, owner, depth)
 
 
-def covered_share(camera: Camera, static_m: np.ndarray, movers: ShapeTable) -> float:
-    """Return the share of a photo's pixels whose middle shows a distractor, without mirrors.
+def first_hits(
+    camera: Camera, table: ShapeTable, behind_m: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the shape in the middle of every pixel, without mirrors and light.
 
     Args:
         camera: OpenCV axes.
-        static_m: [H, W] z of the static surface at the middle of every pixel, m.
-        movers: the distractors of this photo.
+        table: shapes.
+        behind_m: [H, W] z of what hides the shapes behind it, m; None: nothing does.
+
+    Returns:
+        Index of the shape, [H, W] int32, -1 where there is none; its z, [H, W] float64, m.
     """
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    rotation = np.ascontiguousarray(camera.cam_from_world[:3, :3])
-    near = np.empty(len(movers.kind), np.int32)
-    table = movers.columns() + shadow_grid(replace(movers, casts=np.zeros(0, np.bool_)), np.zeros((1, 3)))
-    return _covered(rotation, camera.center, intrinsics, near, table, static_m) / static_m.size
+    shape = (camera.height, camera.width)
+    which, depth_m = np.full(shape, -1, np.int32), np.full(shape, FAR) if behind_m is None else behind_m.copy()
+    _first_hits(
+        np.ascontiguousarray(camera.cam_from_world[:3, :3]),
+        camera.center,
+        np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+        np.empty(len(table.kind), np.int32),
+        table.columns() + shadow_grid(replace(table, casts=np.zeros(0, np.bool_)), np.zeros((1, 3))),
+        which,
+        depth_m,
+    )
+    return which, depth_m
 
 
 @kernel(inline="never")
@@ -285,23 +297,21 @@ def _cone(rotation, k, x0, y0, x1, y1):
 
 
 @kernel(nogil=True)
-def _covered(rotation, eye, k, near, movers, static_m):
-    """Count the pixels whose middle shows a distractor in front of the static surface."""
-    height, width = static_m.shape
+def _first_hits(rotation, eye, k, near, table, which, depth):
+    """Write the nearest shape of each pixel, and its z, where it is nearer than the z that is there."""
+    height, width = which.shape
     o = (eye[0], eye[1], eye[2])
-    hits = 0
     for y0 in range(0, height, _TILE):
         for x0 in range(0, width, _TILE):
             x1, y1 = min(x0 + _TILE, width), min(y0 + _TILE, height)
             axis, cone = _cone(rotation, k, x0, y0, x1, y1)
-            count = _cull(movers, o, axis, cone, near)
+            count = _cull(table, o, axis, cone, near)
             for i in range(y0, y1 if count > 0 else y0):
                 for j in range(x0, x1):
                     d, z = _ray(rotation, k, j + 0.5, i + 0.5)
-                    instant = i % 2 * 2 + j % 2
-                    _, m = nearest(movers, near, count, o, d, static_m[i, j] / z, instant)
-                    hits += m >= 0
-    return hits
+                    t, s = nearest(table, near, count, o, d, depth[i, j] / z, i % 2 * 2 + j % 2)
+                    if s >= 0:
+                        which[i, j], depth[i, j] = s, t * z
 
 
 @kernel(nogil=True)

@@ -216,7 +216,11 @@ def world_of(
     hub: tuple[float, float, float],
 ) -> World:
     """Make the world of a place and of the things that the spec adds to it."""
-    things = [s for thing in what.things for s in shapes_of_thing(thing, plan)]
+    things = [
+        replace(s, thing="" if thing.kind in MIRRORS else f"thing {number}")
+        for number, thing in enumerate(what.things)
+        for s in shapes_of_thing(thing, plan)
+    ]
     circles = [*circles, *map(circle_of, what.things)]
     _shade_feet(textures["ground"], circles, detail_px_per_m, plan)
     keep_out = np.array(circles, float).reshape(-1, 3)
@@ -311,7 +315,7 @@ def on_wall(
 def poster(name: str, at: tuple[float, float, float], axes: Axes, half_m: float = 0.55) -> Shape:
     """Make a sheet of paper with one of scikit-image's photographs and a border."""
     h, w = tx.photograph(name).shape[:2]
-    return surface(at, (half_m, half_m * h / w), f"poster_{name}", axes, False)
+    return replace(surface(at, (half_m, half_m * h / w), f"poster_{name}", axes, False), thing=f"poster {name}")
 
 
 def _shade_feet(

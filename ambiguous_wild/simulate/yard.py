@@ -71,7 +71,8 @@ def yard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
     }
     shapes = [*_fronts(streams[2]), *shapes]
     if what.statue:
-        plinth = [*parts_of("yard plinth"), *placed(figure("stone", "stone", 0.07, 0.8), (0, 0, 0.75), 0.0)]
+        person = placed(figure("stone", "stone", 0.07, 0.8), (0, 0, 0.75), 0.0, thing="statue")
+        plinth = [*parts_of("yard plinth"), *person]
         shapes += placed(plinth, foot, float(rng.uniform(-110, -70)))
     light = sunlight(rng, samples, (-150.0, -120.0), (48.0, 58.0))
     return world_of(PLAN, what, shapes, circles, textures, d, light, hub)
@@ -115,12 +116,13 @@ def _standing(rng: np.random.Generator) -> tuple[list[Shape], list[Circle]]:
     """Make cars, trees, lamp posts, bins and a bench, and their circles on the ground."""
     shapes: list[Shape] = []
     circles: list[Circle] = []
-    for x, y, yaw, paint in _PARKED:
+    for number, (x, y, yaw, paint) in enumerate(_PARKED):
         x, y = x + rng.uniform(-0.2, 0.2), y + rng.uniform(-0.25, 0.25)
         offset = (float(rng.random()), float(rng.random()))
         for part in placed(car("enamel"), (x, y, 0), yaw + rng.uniform(-3, 3), rng.uniform(0.96, 1.06)):
             plain = part.texture == "enamel" and part.tint == (1.0, 1.0, 1.0) and part.half[0] > 0.25
-            shapes.append(_painted(part, paint, offset) if plain else part)
+            painted = _painted(part, paint, offset) if plain else part
+            shapes.append(replace(painted, thing=f"car {number}"))
         circles += [(x, y + dy, 1.0) for dy in (-1.0, 1.0)]
     for x, y in _TREES:
         x, y = x + rng.uniform(-0.3, 0.3), y + rng.uniform(-0.3, 0.3)

@@ -25,7 +25,7 @@ from ambiguous_wild.simulate.world import World
 STATED = {
     "courtyard": (0.14, 0.22),
     "courtyard-plain": (0.16, 0.24),
-    "sticks": (0.05, 0.1),
+    "sticks": (0.08, 0.14),
     "crowd": (0.45, 0.6),
 }
 THIN = ("pole", "barrier", "banner")

@@ -18,20 +18,26 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import mean
 
+from ambiguous_wild.datasets.suites import get_suite
+
 ROOT = Path(__file__).parents[1]
 RANKED = ("3dgs", "dronesplat", "robustsplat", "refinesplat")
 METHODS = (*RANKED, "3dgs+truth")
-RANKED_ON = ("simulated", "composites")
+RANKED_ON = ("aw-sim", "composites")
+SUITE = get_suite("aw-sim").tables
+PASTED = ("cutouts", "patches")
 GROUPS = {
-    "seven simulated courtyards": ("courtyard-",),
-    "simulated room and yard": ("room-", "yard-"),
-    "composites on 40 drone photos": ("seneca-",),
-    "composites on 23 phone photos of a tree": ("monstree-",),
-    "composites on 11 photos of a facade": ("sceaux-",),
-    "composites on 12 drone photos": ("tiny_aerial-",),
+    "six simulated captures, ambiguous in colour": SUITE["colour"],
+    "six, ambiguous in meaning": SUITE["meaning"],
+    "six, ambiguous in both": SUITE["both"],
+    "one without distractors": SUITE["control"],
+    "composites on 40 drone photos": [f"seneca-{kind}" for kind in PASTED],
+    "composites on 23 phone photos of a tree": [f"monstree-{kind}" for kind in PASTED],
+    "composites on 11 photos of a facade": [f"sceaux-{kind}" for kind in PASTED],
+    "composites on 12 drone photos": [f"tiny_aerial-{kind}" for kind in PASTED],
 }
-BASELINES = ("courtyard-colour", "courtyard-plain", "monstree-cutouts")
-COLOURS = ("time-of-day", "white-balance")
+COLOURS = ("coats", "bonnet", "noon")  # captures of the suite whose colours differ between photos
+TIMED = "banners"  # capture on which every method ran alone
 HAND_MADE = ("features=labhog", "instances=graph")  # without pretrained networks; rows need not name them
 Board = Mapping[str, Mapping[str, Mapping[str, float]]]  # scene: method: metric, the mean over seeds
 
@@ -77,20 +83,16 @@ def line(cells: Iterable[str]) -> str:
 def means() -> list[str]:
     """Mean PSNR by group of scenes."""
     found, lines = board(*RANKED_ON), []
-    for group, prefixes in GROUPS.items():
-        scenes = [methods for scene, methods in found.items() if scene.startswith(prefixes)]
-        psnr = [mean(methods[name]["psnr"] for methods in scenes) for name in METHODS]
+    for group, scenes in GROUPS.items():
+        psnr = [mean(found[scene][name]["psnr"] for scene in scenes) for name in METHODS]
         lines.append(line([group, *cells_of(psnr, 1)]))
     return lines
 
 
 def scenes() -> list[str]:
     """PSNR and mask IoU by scene."""
-    found = board(*RANKED_ON)
-    prefixes = [prefix for group in GROUPS.values() for prefix in group]
-    ordered = sorted(found, key=lambda name: next(k for k, p in enumerate(prefixes) if name.startswith(p)))
-    lines = []
-    for name in ordered:
+    found, lines = board(*RANKED_ON), []
+    for name in (scene for group in GROUPS.values() for scene in group):
         cells = cells_of([found[name][method]["psnr"] for method in METHODS], 2)
         for k, method in enumerate(RANKED):
             if "mask_iou" in found[name][method]:
@@ -100,25 +102,27 @@ def scenes() -> list[str]:
 
 
 def baselines() -> list[str]:
-    """PSNR of every method on some scenes, and the time of its training on the first, if it ran alone."""
+    """Mean PSNR of every method by kind of capture, and the seconds of its training, if it ran alone."""
     seconds = {
         label(row): f"{float(row['cost_train_s']):.0f}"
-        for row in rows(*RANKED_ON)
-        if (row["scene"], row["cost_alone"]) == (BASELINES[0], "1")
+        for row in rows("aw-sim")
+        if (row["scene"], row["cost_alone"]) == (TIMED, "1")
     }
-    ranked = ranking(board(*RANKED_ON, only="0"), BASELINES)
+    ranked = ranking(board("aw-sim", only="0"), list(SUITE.values()))
     return [line([f"`{name}`", *psnr, seconds.get(name, "")]) for name, psnr in ranked]
 
 
 def colours() -> list[str]:
     """PSNR of every method where colours differ between photos."""
-    return [line([f"`{name}`", *psnr]) for name, psnr in ranking(board("colours", only="0"), COLOURS)]
+    found = board("aw-sim", only="0")
+    return [line([f"`{name}`", *psnr]) for name, psnr in ranking(found, [[scene] for scene in COLOURS])]
 
 
-def ranking(found: Board, scenes: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Name and PSNR of the methods that are measured on all these scenes, the best in the mean first."""
+def ranking(found: Board, groups: Sequence[Sequence[str]]) -> list[tuple[str, list[str]]]:
+    """Name and mean PSNR by group of the methods that are measured on all scenes, the best in the mean first."""
+    scenes = [scene for group in groups for scene in group]
     psnr = {
-        name: [found[scene][name]["psnr"] for scene in scenes]
+        name: [mean(found[scene][name]["psnr"] for scene in group) for group in groups]
         for name in found[scenes[0]]
         if all(name in found[scene] for scene in scenes)
     }

@@ -3,10 +3,10 @@
     python benchmarks/publish.py --work DIR [--data DIR] [--seeds 0 1 2] [--methods ...] [--iterations 1000]
         [--jobs 2] [--only NAME...] [--set METHOD.OPTION=VALUE...]
 
-Captures: presets of `aw simulate`, and distractors pasted on the photos of --data before structure from
-motion (`aw composite`). --data holds a folder of photos for each base, and cutouts/; without it no
-composites are made. All methods of a scene train with the effects of its plan. Checked runs go
-to the board, leaderboard/measured; then `python benchmarks/figures.py` writes the tables from it.
+Captures: the suite aw-sim, and distractors pasted on the photos of --data before structure from motion
+(`aw composite`). --data holds a folder of photos for each base, and cutouts/; without it no composites are
+made. --methods all: every method of `aw methods`. All methods of a scene train with the effects of its plan.
+Checked runs go to the board, leaderboard/measured; then `python benchmarks/figures.py` writes the tables.
 """
 
 from __future__ import annotations
@@ -20,14 +20,10 @@ from pathlib import Path
 from job_queue import Run, aw, count, exit_code, run_all, seed
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.datasets.suites import get_suite
+from ambiguous_wild.methods.registry import all_methods
 
 ROOT = Path(__file__).parents[1]
-PRESETS = (
-    *(f"courtyard-{kind}" for kind in ("plain", "colour", "twin", "thin", "sparse", "crowd", "clean")),
-    "room-colour",
-    "yard-cars",
-)
-COLOURS = ("time-of-day", "white-balance")  # presets whose colours differ between photos: --protocol half
 BASES = {"seneca": 4, "monstree": 4, "sceaux": 4, "tiny_aerial": 2}  # downsampling to 240 px and more
 KINDS = ("cutouts", "patches")
 METHODS = ("3dgs", "dronesplat", "robustsplat", "refinesplat", "3dgs+truth")
@@ -56,9 +52,10 @@ class Capture:
 
 def captures(data: Path | None) -> Iterator[Capture]:
     """All captures; those of real photos only with a folder of photos."""
-    for name in (*PRESETS, *COLOURS):
-        words = ("simulate", name, "--width", "480", "--seed", str(WORLD))
-        yield Capture(name, "colours" if name in COLOURS else "simulated", 2, words)
+    suite = get_suite("aw-sim")
+    for name in suite.scenes:
+        words = ("simulate", name, "--width", str(suite.width), "--seed", str(WORLD))
+        yield Capture(name, suite.dataset, suite.factor, words)
     for base, factor in BASES.items() if data is not None else ():
         for kind in KINDS:
             words = ("composite", str(data / base), "--seed", str(WORLD))
@@ -72,7 +69,6 @@ def runs_of(scene: Path, args: argparse.Namespace) -> Iterator[Run]:
     for number in args.seeds:
         words = ("--scene", str(scene), "--seed", str(number), "--iterations", str(args.iterations))
         words += ("--device", "cpu", "--threads", "1", "--no-pictures", "-o", str(args.runs))
-        words += ("--protocol", "half") if scene.name in COLOURS else ()
         for method in args.methods:
             folder = args.runs / scene.name / method / f"seed{number}"
             own = tuple(option for owner, option in options if owner == method)
@@ -91,6 +87,8 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=count, default=2, help="runs at a time")
     parser.add_argument("--board", type=Path, default=ROOT / "leaderboard")
     args = parser.parse_args(words)
+    if args.methods == ["all"]:
+        args.methods = [*all_methods()]
     args.runs = args.work / "-".join(["runs", *args.set])  # runs with other options have their own folder
     known = {capture.name: capture for capture in captures(args.data)}
     if unknown := set(args.only or ()) - known.keys():

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NotRequired, TypedDict
 
-from ambiguous_wild.core.scene import FileEntry
+from ambiguous_wild.core.scene import Evaluation, FileEntry
 
 PlainSettings = dict[str, str | int | bool | None]  # `BuildSettings` as JSON
 
@@ -295,6 +295,7 @@ class BuildRecord(TypedDict):
     masks: MaskResult | None
     fixed_to_camera: list[FixedRecord]
     truth: dict[str, int] | None
+    evaluation: NotRequired[Evaluation]  # as a simulated capture says
 
 
 class KeyedRecord(BuildRecord):

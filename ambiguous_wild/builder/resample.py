@@ -27,7 +27,7 @@ from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.io.lens import Lens, make_lens
 from ambiguous_wild.io.photos import MIN_SIDE
 
-TRUTH_PARTS = ("distractor", "clean")
+TRUTH_PARTS = ("distractor", "shadow", "clean")
 MAX_LOST = 0.9  # share of the photo that is kept, below which a message says so
 FACTORS = (1, 2, 4, 8)
 TARGET_SIDE = 480  # px; literature trains at about 504 x 378
@@ -155,7 +155,7 @@ def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def _truth(folder: Path, lens: Lens, photo: ScreenedPhoto, truth: Path, factor: int) -> list[str]:
-    """Resample the truth of one photo: the mask like masks, the clean photo like the photo."""
+    """Resample the truth of one photo: distractors and shadows like masks, the clean photo like the photo."""
     parts = PurePosixPath(photo.source).with_suffix("").parts
     original = "/".join(parts[parts[0] in ("train", "test", "images") :])
     written = []
@@ -163,14 +163,14 @@ def _truth(folder: Path, lens: Lens, photo: ScreenedPhoto, truth: Path, factor: 
         path = truth / part / f"{original}.png"
         if not path.is_file():
             continue
-        pixels = read_gray(path) if part == "distractor" else read_png_rgb(path)
+        pixels = read_png_rgb(path) if part == "clean" else read_gray(path)
         if pixels.shape[:2] != (photo.height, photo.width):
             raise AwError(
                 f"{path} is {pixels.shape[1]}x{pixels.shape[0]} but its photo "
                 f"{photo.width}x{photo.height}: the truth belongs to another capture; remove truth/ "
                 "or make the capture again"
             )
-        flat = lens.remap(pixels, nearest=part == "distractor")
+        flat = lens.remap(pixels, nearest=part != "clean")
         write_png(folder / "truth" / part / photo.name, _reduced(flat, factor))
         written.append(part)
     return written

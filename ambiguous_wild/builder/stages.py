@@ -51,7 +51,7 @@ from ambiguous_wild.core.config import to_plain
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ColmapModel
-from ambiguous_wild.io.files import sha256_file
+from ambiguous_wild.io.files import own_json, sha256_file
 from ambiguous_wild.io.motion_points import FILE
 from ambiguous_wild.io.scene_folder import ALL_TRAINED, MAP, TEST_EVERY, read_list
 
@@ -196,6 +196,8 @@ class Stages:
             "capture": _relative(capture.root, self.target),
             "seconds": {"collect": round(collect_s, 3), **work.seconds()},
         }
+        if capture.truth and own_json(capture.truth / "capture.json").get("evaluation") == {"protocol": "half"}:
+            record["evaluation"] = {"protocol": "half"}
         truth_files = [capture.truth / n for n in ("cameras.json", "capture.json")] if capture.truth else []
         parts = SceneParts(
             flat.folder,

@@ -147,7 +147,8 @@ def _outside(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> int:
     if not spec.distractors or all(d.path != "elsewhere" for d in spec.distractors):
         return 0  # the place of a walker is given, not chosen
     slack = 0.02 + 0.1 * (high - low)  # because layouts were chosen by a small preview
-    return sum(not low - slack <= photo["occlusion"] <= high + slack for photo in photos.values())
+    shares = [sum(d["occlusion"] for d in photo["distractors"]) for photo in photos.values()]
+    return sum(not low - slack <= share <= high + slack for share in shares)
 
 
 def _never_seen(spec: CaptureSpec, photos: dict[str, PhotoTruth]) -> list[str]:

@@ -13,7 +13,7 @@ import torch
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.harness.measures import ImageRow, measure_images, metrics
-from ambiguous_wild.harness.regions import true_distractor
+from ambiguous_wild.harness.regions import true_distractor, true_shadow
 from ambiguous_wild.harness.result_file import Cost, MaskScores
 from ambiguous_wild.io.files import atomic_dir
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
@@ -199,7 +199,8 @@ def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: 
 
     Returns:
         IoU, precision and recall of the distractor pixels, counted over all photos together (a single photo
-        has no precision where nothing is masked), or None without truth.
+        has no precision where nothing is masked), or None without truth. Shadows and reflections of
+        distractors are not counted: to mask them is as right as not to.
     """
     counts = []
     with atomic_dir(folder) as temporary:
@@ -208,8 +209,10 @@ def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: 
             path.parent.mkdir(parents=True, exist_ok=True)
             write_png(path, keep.astype(np.uint8) * 255)
             truth = true_distractor(scene, view)
+            shadow = true_shadow(scene, view)
             if truth is not None:
-                counts.append(mask_metrics.confusion(keep, ~truth))
+                scored = keep if shadow is None else keep | (shadow & ~truth)  # true negatives: in no score
+                counts.append(mask_metrics.confusion(scored, ~truth))
     if not counts:
         return None
     total = mask_metrics.pooled(counts)

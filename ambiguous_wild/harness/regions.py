@@ -270,7 +270,16 @@ def _find_regions(scene: Scene) -> Regions:
 
 def true_distractor(scene: Scene, view: View) -> np.ndarray | None:
     """Return the exact mask of a photo, [H, W] bool, True on distractors; None if the capture has none."""
-    path = scene.root / "truth" / "distractor" / Path(view.name).with_suffix(".png")
+    return _exact(scene, view, "distractor")
+
+
+def true_shadow(scene: Scene, view: View) -> np.ndarray | None:
+    """Return where distractors change a photo without being there, [H, W] bool; None if nowhere."""
+    return _exact(scene, view, "shadow")
+
+
+def _exact(scene: Scene, view: View, part: str) -> np.ndarray | None:
+    path = scene.root / "truth" / part / Path(view.name).with_suffix(".png")
     if not path.exists():
         return None
     mask = read_gray(path) >= 128

@@ -56,6 +56,9 @@ class TruthMask(FixedMasks):
 
     def setup(self, data: TrainData) -> None:
         masks = [read_gray(path) >= 128 for path in truth_files(data.scene, "distractor")]
+        if (data.scene.root / "truth" / "shadow").is_dir():
+            shadows = truth_files(data.scene, "shadow")
+            masks = [mask | (read_gray(path) >= 128) for mask, path in zip(masks, shadows, strict=True)]
         _check_sizes(data.scene, masks)
         self.keeps = [keep_outside(mask, self.config.dilation) for mask in masks]
         super().setup(data)

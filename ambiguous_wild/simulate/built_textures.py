@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ambiguous_wild.simulate.textures import Colour, laid, octaves, scattered, step, tint
+from ambiguous_wild.simulate.textures import Colour, laid, octaves, scattered, step, tint, uniform
 
 PAINT: Colour = (0.52, 0.47, 0.38)  # colour of the room's walls
 
@@ -32,7 +32,7 @@ def enamel(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: 
     """Light car paint with dust and scratches, to be tinted, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     dust = 0.75 + 0.3 * octaves(rng, h, w, 0.5 * px_per_m, 5)
-    scratches = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 0.1 * px_per_m, sigmaY=0.7)
+    scratches = cv2.GaussianBlur(uniform(rng, h, w), (0, 0), 0.1 * px_per_m, sigmaY=0.7)
     return np.asarray(np.repeat((dust * (0.9 + 0.8 * (scratches - 0.5)))[..., None], 3, 2), dtype=np.float32)
 
 
@@ -51,22 +51,22 @@ def yard_ground(rng: np.random.Generator, width_m: float, height_m: float, px_pe
     """Asphalt with parking lines, a paved walk along the walls, grass in the joints."""
     road = asphalt(rng, width_m, height_m, px_per_m)
     h, w = road.shape[:2]
-    x = ((np.arange(w, dtype=np.float32) + 0.5) / px_per_m - width_m / 2)[None]
-    y = ((np.arange(h, dtype=np.float32) + 0.5) / px_per_m - height_m / 2)[:, None]
+    x = ((np.arange(w) + 0.5) / px_per_m - width_m / 2)[None]
+    y = ((np.arange(h) + 0.5) / px_per_m - height_m / 2)[:, None]
     paving = laid("brick", h, w, px_per_m, 2.4, 3.0, rng.random(2))
     paving = paving * tint(rng, h, w, px_per_m, (0.3, 0.28, 0.25), 0.4)
     edge = np.maximum(np.abs(x) - (width_m / 2 - 2.6), np.abs(y) - (height_m / 2 - 2.4))
     ragged = 0.12 * (octaves(rng, h, w, 0.3 * px_per_m, 3) - 0.5)
     ground = road + (paving - road) * step(0.0, 0.02, edge + ragged)
     kerb = np.exp(-(((edge - 0.06) / 0.05) ** 2))[..., None]
-    ground = ground + (np.array([0.4, 0.39, 0.36], np.float32) - ground) * 0.8 * np.minimum(kerb, 1)
+    ground = ground + (np.array([0.4, 0.39, 0.36]) - ground) * 0.8 * np.minimum(kerb, 1)
     worn = octaves(rng, h, w, 0.15 * px_per_m, 3)
     for at in np.arange(-width_m / 2 + 3.2, width_m / 2 - 3.0, 2.7):
         line = (np.abs(x - at) < 0.06) & (np.abs(y) > height_m / 2 - 6.6) & (np.abs(y) < height_m / 2 - 2.6)
         white = (line * (0.4 + 0.6 * (worn > 0.45)))[..., None]
         ground = ground + (0.62 - ground) * 0.85 * white
     weeds = step(0.6, 0.68, octaves(rng, h, w, 0.5 * px_per_m, 6) + 0.12 * np.exp(-np.abs(edge) / 0.2))
-    grass = scattered("grass", rng, h, w, px_per_m, 1.2) * np.array([0.1, 0.15, 0.045], np.float32)
+    grass = scattered("grass", rng, h, w, px_per_m, 1.2) * np.array([0.1, 0.15, 0.045])
     return np.asarray(ground + 0.9 * (grass - ground) * weeds, dtype=np.float32)
 
 
@@ -77,9 +77,9 @@ def parquet(rng: np.random.Generator, width_m: float, height_m: float, px_per_m:
     shift = rng.uniform(0, 1.3, plank.max() + 1)[plank][:, None]
     along = ((np.arange(w)[None] + 0.5) / px_per_m + shift) / 1.3
     board = plank[:, None] * 97 + along.astype(int)
-    tone = (0.55 + 0.75 * rng.random(board.max() + 1)).astype(np.float32)[board]
+    tone = (0.55 + 0.75 * rng.random(board.max() + 1))[board]
     joint = ((along % 1.0) < 0.012 / 1.3) | (((np.arange(h) + 0.5) / (0.11 * px_per_m) % 1.0) < 0.07)[:, None]
-    grain = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 0.2 * px_per_m, sigmaY=0.6) - 0.5
+    grain = cv2.GaussianBlur(uniform(rng, h, w), (0, 0), 0.2 * px_per_m, sigmaY=0.6) - 0.5
     value = tone * (1 + 3.0 * grain) * np.where(joint, 0.3, 1.0)
     brown = tint(rng, h, w, px_per_m, (0.34, 0.2, 0.1), 0.25)
     return np.asarray(np.clip(value, 0.05, 2.5)[..., None] * brown, dtype=np.float32)
@@ -87,19 +87,19 @@ def parquet(rng: np.random.Generator, width_m: float, height_m: float, px_per_m:
 
 def rug(rng: np.random.Generator, height: int = 512, width: int = 768) -> np.ndarray:
     """A woven rug: stripes, diamonds that differ, a fringe; [H, W, 3] linear light."""
-    y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+    y, x = np.mgrid[0:height, 0:width]
     colours = np.array(
         [[0.34, 0.05, 0.04], [0.05, 0.07, 0.16], [0.55, 0.42, 0.24], [0.12, 0.2, 0.16], [0.5, 0.18, 0.05]],
         np.float32,
     )
     row, column = (y // 64).astype(int), (x // 64).astype(int)
     pick = rng.integers(0, 5, (height // 64 + 1, width // 64 + 1, 2))
-    inner = np.abs(x % 64 - 32) + np.abs(y % 64 - 32) < 14 + 14 * rng.random((height, 1), dtype=np.float32)
+    inner = np.abs(x % 64 - 32) + np.abs(y % 64 - 32) < 14 + 14 * uniform(rng, height, 1)
     image = np.where(inner[..., None], colours[pick[row, column, 0]], colours[pick[row, column, 1]])
     border = np.minimum(np.minimum(x, width - 1 - x), np.minimum(y, height - 1 - y))
     image = np.where((border < 26)[..., None], colours[2], image)
     image = np.where((np.abs(border - 34) < 7)[..., None], colours[0], image)
-    weave = 0.75 + 0.5 * rng.random((height, width, 1), dtype=np.float32)
+    weave = 0.75 + 0.5 * uniform(rng, height, width, 1)
     return np.asarray(image * weave * (0.7 + 0.6 * octaves(rng, height, width, 90.0))[..., None], np.float32)
 
 
@@ -126,9 +126,9 @@ def facade(
     fallen = step(0.62, 0.635, octaves(rng, h, w, 1.2 * px_per_m, 6))
     courses = laid("brick", h, w, px_per_m, 1.9, 90.0, rng.random(2)) ** 1.2
     brick = courses * tint(rng, h, w, px_per_m, (0.3, 0.14, 0.085), 0.5)
-    foot = step(0.0, 0.02, 0.8 - np.arange(h, dtype=np.float32)[:, None] / px_per_m)
+    foot = step(0.0, 0.02, 0.8 - np.arange(h)[:, None] / px_per_m)
     wall = wall + (brick - wall) * np.maximum(fallen, foot)
-    streaks = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 2.0, sigmaY=0.6 * px_per_m) - 0.5
+    streaks = cv2.GaussianBlur(uniform(rng, h, w), (0, 0), 2.0, sigmaY=0.6 * px_per_m) - 0.5
     wall = wall * np.clip(1 + 5.0 * streaks, 0.6, 1.3)[..., None]
 
     def fill(x0: float, x1: float, y0: float, y1: float, paint: np.ndarray | Colour) -> None:

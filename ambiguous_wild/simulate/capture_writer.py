@@ -5,7 +5,8 @@ RAW/test/IMG_0101.jpg ...         other viewpoints, no distractors
 RAW/truth/cameras.json            name -> size, fx, fy, cx, cy, cam_from_world (OpenCV axes, metres)
 RAW/truth/distractor/<stem>.png   255 where any part of the pixel shows a distractor, else 0
 RAW/truth/clean/<stem>.png        the train photo without distractors, same effects, before JPEG
-RAW/truth/shadow/<stem>.png       with moving shadows: 255 where one darkens the static scene
+RAW/truth/shadow/<stem>.png       with moving shadows or panes of glass: 255 where a shadow, or what a pane
+                                  reflects, changes the static scene
 RAW/truth/depth/<stem>.png        optional: z of the static surface, 16 bit, millimetres
 RAW/truth/capture.json            spec, seed, versions, label; per photo occlusion, placed distractors and
                                   drawn effects; sha256 of every file
@@ -218,7 +219,7 @@ def simulate(
         return {**earlier, "reused": True}
     world, planned = plan(spec, seed)
     with atomic_dir(out) as folder:
-        shadow = ["truth/shadow"] if spec.effects.moving_shadow is not None else []
+        shadow = ["truth/shadow"] if spec.has_shadows else []
         optional = [*shadow, *(["truth/depth"] if depth else [])]
         for part in ("train", "test", "truth/distractor", "truth/clean", *optional):
             (folder / part).mkdir(parents=True)
@@ -370,7 +371,7 @@ def _photo_facts(spec: CaptureSpec, photo: PlannedPhoto, rendered: RenderedPhoto
 
 def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, PhotoTruth]) -> CaptureTruth:
     shares = [p["occlusion"] for p in photos.values()]
-    return {
+    facts: CaptureTruth = {
         "schema": 1,
         "preset": spec.name,
         "seed": seed,
@@ -378,13 +379,18 @@ def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, PhotoT
         "version": {"ambiguous_wild": __version__, "scikit-image": version("scikit-image")},
         "spec": plain_spec(spec),
         "designed": to_plain(spec.designed),
-        "mask": "255 where any part of a pixel shows a distractor; distractors cast no shadow on the scene",
+        "mask": "255 where any part of a pixel shows a distractor, also in a mirror; their shadows on the scene, "
+        "if they cast any, and reflections in glass are in truth/shadow",
         "clean": "same camera, same effects, no distractors and no moving shadow, before JPEG",
         "test": "no distractors; of the effects only specular and lens_distortion",
         "occlusion": summary(shares),
         "photos": photos,
         "licence": "CC0; textures from photographs in scikit-image that are CC0 or in the public domain",
     }
+    if spec.effects.changes_colours:
+        # Test photos have neutral colours, which the train photos do not tell.
+        facts["evaluation"] = {"protocol": "half"}
+    return facts
 
 
 def _code_hash() -> str:

@@ -1,7 +1,7 @@
 """Distractors: shapes that are placed in the world anew for every photo.
 
-Perspective, occlusion and shadows on distractors are exact. They cast no shadow on the static world, so that
-outside their pixels the photo with distractors equals the clean photo.
+Perspective, occlusion and shadows on distractors are exact. Unless the spec says `cast_shadows`, they cast none
+on the static world, so that outside their pixels the photo with distractors equals the clean photo.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import numpy as np
 
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate.image_effects import specular
-from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID
+from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID, INSTANTS
 from ambiguous_wild.simulate.shapes import Shape, barrier, figure, placed, shape_table
 from ambiguous_wild.simulate.spec import STATUES, CaptureSpec, Distractor, GroundPlan
-from ambiguous_wild.simulate.tracer import ShapeTable, trace
+from ambiguous_wild.simulate.tracer import ShapeTable, covered_share, trace
 from ambiguous_wild.simulate.world import World, car, parts_of, placard, statue
 
 _TRIES = 80  # layouts drawn for a photo, of which the best is taken
@@ -37,15 +37,30 @@ class DistractorPose:
     x_m: float
     y_m: float
     yaw_deg: float
-    pose: float  # stride and arm of a figure, 0 to 1
+    pose: float  # stride, arm and bend of a figure, 0 to 1
 
 
 def shapes_of(distractor: Distractor, placement: DistractorPose, plan: GroundPlan) -> list[Shape]:
-    """Make the distractor's shapes in the world, owned by ``placement.which + 1``."""
-    at = (placement.x_m, placement.y_m, distractor.lift_m * placement.pose)
+    """Make the distractor's shapes in the world, owned by ``placement.which + 1``; a blurred one at each instant."""
+    at = np.array([placement.x_m, placement.y_m, distractor.lift_m * placement.pose])
     parts = [_tinted(s, distractor) for s in _parts(distractor, placement.pose, plan)]
-    moved = placed(parts, at, placement.yaw_deg, distractor.size)
-    return [replace(s, owner=placement.which + 1) for s in moved]
+    owner = placement.which + 1
+    if not distractor.blur_m:
+        return placed(parts, at, placement.yaw_deg, distractor.size, owner=owner)
+    facing = np.deg2rad(placement.yaw_deg) - np.pi / 2  # figures face -y
+    way = distractor.blur_m * np.array([np.cos(facing), np.sin(facing), 0.0])
+    return [
+        shape
+        for k in range(INSTANTS)
+        for shape in placed(
+            parts,
+            at + ((k + 0.5) / INSTANTS - 0.5) * way,
+            placement.yaw_deg,
+            distractor.size,
+            owner=owner,
+            instant=k,
+        )
+    ]
 
 
 def _parts(distractor: Distractor, pose: float, plan: GroundPlan) -> list[Shape]:
@@ -53,7 +68,8 @@ def _parts(distractor: Distractor, pose: float, plan: GroundPlan) -> list[Shape]
     texture = distractor.texture
     match distractor.kind:
         case "visitor":
-            return figure(texture, distractor.head or texture, 0.06 + 0.26 * pose, pose)
+            bend = distractor.bend_deg * (0.5 - 0.5 * np.cos(4 * np.pi * pose))
+            return figure(texture, distractor.head or texture, 0.06 + 0.26 * pose, pose, bend_deg=bend)
         case "twin":
             return [
                 *parts_of("base of a twin", texture),
@@ -70,27 +86,30 @@ def _parts(distractor: Distractor, pose: float, plan: GroundPlan) -> list[Shape]
         case "placard":
             return placard(texture, plan)
         case "car":
-            return car(texture)
+            return car(texture, paint=distractor.tint)
     if distractor.kind in STATUES:
         return [statue(distractor.kind, texture, 1.6)]
     return [Shape(ELLIPSOID, (0, 0, 0.4), (0.4, 0.4, 0.4), texture)]
 
 
 def _tinted(shape: Shape, distractor: Distractor) -> Shape:
-    """Tint the parts with the distractor's texture, but not a head with another texture."""
-    if shape.texture != distractor.texture:
+    """Tint the parts with the distractor's texture, but not a head with another texture, nor glass of a car."""
+    if shape.texture != distractor.texture or distractor.kind == "car" or distractor.tint == (1.0, 1.0, 1.0):
         return shape
     r, g, b = (x * y for x, y in zip(shape.tint, distractor.tint))
     return replace(shape, tint=(r, g, b))
 
 
+def mover_shapes(spec: CaptureSpec, placements: tuple[DistractorPose, ...], plan: GroundPlan) -> list[Shape]:
+    """Return all distractors of one photo."""
+    shapes = [s for p in placements for s in shapes_of(spec.distractors[p.which], p, plan)]
+    gloss = spec.effects.specular
+    return shapes if gloss is None else specular(shapes, gloss.textures, gloss.strength, gloss.sharpness)
+
+
 def movers(spec: CaptureSpec, placements: tuple[DistractorPose, ...], world: World) -> ShapeTable:
     """Return all distractors of one photo as a table for the ray caster."""
-    shapes = [s for p in placements for s in shapes_of(spec.distractors[p.which], p, world.plan)]
-    gloss = spec.effects.specular
-    if gloss is not None:
-        shapes = specular(shapes, gloss.textures, gloss.strength, gloss.sharpness)
-    return shape_table(shapes, world.atlas)
+    return shape_table(mover_shapes(spec, placements, world.plan), world.atlas)
 
 
 def lay_out(
@@ -106,6 +125,7 @@ def lay_out(
     chosen: list[tuple[DistractorPose, ...]] = []
     static = world.table()
     light = replace(world.light, sun=np.ascontiguousarray(world.light.sun[:1]))  # one sample a pixel
+    nobody = shape_table((), world.atlas)
     low, high = spec.occlusion
     # The place of a walker is given, and choosing among layouts would change how often it is present.
     tries = 1 if all(d.path != "elsewhere" for d in spec.distractors) else _TRIES
@@ -121,10 +141,13 @@ def lay_out(
         if present is not None and not any(present):
             chosen.append(())
             continue
+        if tries == 1:
+            chosen.append(_draw(spec, camera, world, chosen, rng))
+            continue
+        depth_m = trace(small, static, nobody, world.atlas, light).depth_m
         for attempt in range(tries):
             layout = _draw(spec, camera, world, chosen, rng, present)
-            seen = trace(small, static, movers(spec, layout, world), world.atlas, light)
-            share = float(np.mean(seen.owner > 0))
+            share = covered_share(small, depth_m, movers(spec, layout, world))
             tolerance = (high - low) * (0.1 + 0.4 * attempt / tries)
             gap = max(abs(share - aim) - tolerance, 0.0) + 10 * max(low - share, share - high, 0.0)
             if gap < best_gap:
@@ -148,7 +171,10 @@ def _draw(
         if not present[which] if present is not None else rng.random() > distractor.presence:
             continue
         if distractor.path == "walk":
-            place = _walker_placement(which, distractor, len(earlier) / max(spec.train_views - 1, 1))
+            if len(distractor.waypoints) == 1:
+                place = _standing_placement(which, distractor, rng)
+            else:
+                place = _walker_placement(which, distractor, len(earlier) / max(spec.train_views - 1, 1))
             away = np.hypot(*(camera.center[:2] - (place.x_m, place.y_m)))
             if away >= distractor.distance_m[0] and _is_free(place, world, [], distractor):
                 layout.append(place)
@@ -175,6 +201,13 @@ def _random_placement(
     flat = direction[:2] / np.linalg.norm(direction[:2])
     x, y = camera.center[:2] + rng.uniform(*distractor.distance_m) * flat
     return DistractorPose(which, float(x), float(y), float(rng.uniform(-180, 180)), float(rng.random()))
+
+
+def _standing_placement(which: int, distractor: Distractor, rng: np.random.Generator) -> DistractorPose:
+    """Place a distractor that stands still; a visitor turns and moves its arms."""
+    x, y = distractor.waypoints[0]
+    yaw, pose = (rng.uniform(-180, 180), rng.random()) if distractor.kind == "visitor" else (0.0, 0.4)
+    return DistractorPose(which, float(x), float(y), float(yaw), float(pose))
 
 
 def _walker_placement(which: int, distractor: Distractor, progress: float) -> DistractorPose:

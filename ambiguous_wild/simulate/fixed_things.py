@@ -32,7 +32,7 @@ def fixed_layer(
         return _stamp(height, width, number)
     alpha = _cover(height, width)
     paint = _paint(height, width, np.random.default_rng(seed))
-    mirrored = cv2.GaussianBlur(np.ascontiguousarray(photo[::-1]), (0, 0), max(_BLUR * width, 0.5))
+    mirrored = cv2.GaussianBlur(photo[::-1].astype(np.float64), (0, 0), max(_BLUR * width, 0.5))
     light = (1 - _REFLECTED) * paint + _REFLECTED * mirrored
     return np.concatenate([light * alpha[..., None], alpha[..., None]], axis=2).astype(np.float32)
 

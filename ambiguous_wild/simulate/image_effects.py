@@ -349,13 +349,14 @@ def resample(image: np.ndarray, sources: list[np.ndarray], border: int, fine: in
         border: of the enlarged camera, coarse px.
         fine: fine pixels a side of a pixel.
     """
-    total: np.ndarray = np.zeros((), np.float32)
+    total: np.ndarray = np.zeros(())
+    image = image.astype(np.float64)  # float32 sums differ in their last bit between processors
     for source in sources:
         index = ((source + border) * fine - 0.5).astype(np.float32)
         total = total + cv2.remap(
             image, index[..., 0], index[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-    mean = total / np.float32(len(sources))
+    mean = total / len(sources)
     height, width = mean.shape[0] // fine, mean.shape[1] // fine
     blocks = mean.reshape(height, fine, width, fine, *mean.shape[2:])
     return np.asarray(blocks.mean((1, 3)), np.float32)

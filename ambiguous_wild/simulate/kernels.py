@@ -1,7 +1,8 @@
 """Inner kernels of the ray caster: intersection, texture lookup and shading.
 
-Arguments: a table is `ShapeTable.columns()`, an atlas `(texels, offset, width, height, levels)`, a light
-`(sun directions, sun colour, sky colour, ground colour)`; points and directions are tuples of three.
+Arguments: a table is `ShapeTable.columns()` and the arrays of its `ShadowGrid`, an atlas `(texels, offset, width,
+height, levels)`, a light `(sun directions, sun colour, sky colour, ground colour)`, a sample `(index of its sun
+direction, instant)`; points and directions are tuples of three.
 """
 
 from __future__ import annotations
@@ -14,6 +15,9 @@ from ambiguous_wild.io.numba_cache import cached_njit
 
 QUAD, BOX, ELLIPSOID, CAPSULE, CYLINDER, VOLUME = range(6)
 PLANAR, BY_FACE, DOME = range(3)  # texture mapping
+INSTANTS = 4  # of an exposure; each of four neighbouring rays is traced at another one
+ALWAYS = -1  # instant of what is there during the whole exposure
+GLASS = 0.08  # share of the light that a pane reflects at a right angle, on both of its surfaces
 FAR = 1e30
 _STEPS = 128
 _NEAR_M = 4e-4  # distance at which a ray has reached the surface
@@ -167,17 +171,19 @@ def _hit(table, s, o, d, far):
     h = (half[s, 0], half[s, 1], half[s, 2])
     lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
     if kind == VOLUME:
-        return sphere_trace(table[13][table[12][s]], lo, ld, h[0], far)
+        return sphere_trace(table[14][table[13][s]], lo, ld, h[0], far)
     return _intersect(kind, lo, ld, h, far)
 
 
 @kernel(inline="never")
-def nearest(table, which, count, o, d, far):
-    """Return the nearest hit among the listed shapes: (distance, shape or -1)."""
+def nearest(table, which, count, o, d, far, instant):
+    """Return the nearest hit among the listed shapes at an instant: (distance, shape or -1)."""
     best, hit = far, -1
-    center, radius = table[2], table[4]
+    center, radius, instants = table[2], table[4], table[11]
     for k in range(count):
         s = which[k]
+        if instants[s] != ALWAYS and instants[s] != instant:
+            continue
         qx, qy, qz = center[s, 0] - o[0], center[s, 1] - o[1], center[s, 2] - o[2]
         along = qx * d[0] + qy * d[1] + qz * d[2]
         if qx * qx + qy * qy + qz * qz - along * along > radius[s] * radius[s]:
@@ -191,10 +197,20 @@ def nearest(table, which, count, o, d, far):
 
 
 @kernel(inline="never")
-def _shadowed(table, o, d):
-    center, radius, casts = table[2], table[4], table[9]
-    for s in range(len(casts)):
-        if not casts[s]:
+def _shadowed(table, o, d, sample):
+    """Return whether a shape lies between the point and the sun: one of those in the point's cell of the grid."""
+    center, radius, instants = table[2], table[4], table[11]
+    frame, start, members = table[15], table[16], table[17]
+    n, instant = sample
+    cells = int(math.sqrt(start.shape[1] - 1))
+    a = (frame[n, 0] * o[0] + frame[n, 1] * o[1] + frame[n, 2] * o[2] - frame[n, 6]) * frame[n, 8]
+    b = (frame[n, 3] * o[0] + frame[n, 4] * o[1] + frame[n, 5] * o[2] - frame[n, 7]) * frame[n, 8]
+    if not (0.0 <= a < cells and 0.0 <= b < cells):
+        return False
+    cell = int(b) * cells + int(a)
+    for k in range(start[n, cell], start[n, cell + 1]):
+        s = members[k]
+        if instants[s] != ALWAYS and instants[s] != instant:
             continue
         qx, qy, qz = center[s, 0] - o[0], center[s, 1] - o[1], center[s, 2] - o[2]
         along = qx * d[0] + qy * d[1] + qz * d[2]
@@ -293,16 +309,17 @@ def _gloss(strength, sharpness, n, d, sun, sunlit, light):
 
 
 @kernel(inline="never")
-def shade(table, s, t, o, d, spread, atlas, light, sun, static, movers, shadow_casters):
+def shade(table, s, t, o, d, spread, atlas, light, sample, static, movers, shadow_casters):
     """Compute the colour of shape s at distance t: texture, sun with shadow, sky light from above and below.
 
-    Returns the colour with and without the shadows of `shadow_casters`, equal where no shadow falls.
+    Distractors shade each other, and the scene where they are among the `shadow_casters`. Returns the colour
+    with and without the shadows of these, equal where none falls.
     """
     kind, half, mapping, uv, tint = table[0][s], table[3], table[6][s], table[7], table[8]
     lo, ld = _local(table, s, o[0], o[1], o[2], True), _local(table, s, d[0], d[1], d[2], False)
     p = (lo[0] + t * ld[0], lo[1] + t * ld[1], lo[2] + t * ld[2])
     h = (half[s, 0], half[s, 1], half[s, 2])
-    n = surface_normal(table[13][table[12][s]], p, h[0], ld) if kind == VOLUME else _normal(kind, p, h, ld)
+    n = surface_normal(table[14][table[13][s]], p, h[0], ld) if kind == VOLUME else _normal(kind, p, h, ld)
     cosine = -(n[0] * ld[0] + n[1] * ld[1] + n[2] * ld[2])
     texture = table[5][s]
     if mapping == DOME:
@@ -328,20 +345,20 @@ def shade(table, s, t, o, d, spread, atlas, light, sun, static, movers, shadow_c
     wx = rot[s, 0, 0] * n[0] + rot[s, 1, 0] * n[1] + rot[s, 2, 0] * n[2]
     wy = rot[s, 0, 1] * n[0] + rot[s, 1, 1] * n[1] + rot[s, 2, 1] * n[2]
     wz = rot[s, 0, 2] * n[0] + rot[s, 1, 2] * n[1] + rot[s, 2, 2] * n[2]
+    sun = (light[0][sample[0], 0], light[0][sample[0], 1], light[0][sample[0], 2])
     lit = wx * sun[0] + wy * sun[1] + wz * sun[2]
     darkened = False
     if lit > 0.0:
         lift = 2e-3
         q = (o[0] + t * d[0] + lift * wx, o[1] + t * d[1] + lift * wy, o[2] + t * d[2] + lift * wz)
-        # distractors cast no shadow on the scene
-        if _shadowed(static, q, sun) or (table[10][s] > 0 and _shadowed(movers, q, sun)):
+        if _shadowed(static, q, sun, sample) or (table[10][s] > 0 and _shadowed(movers, q, sun, sample)):
             lit = 0.0
         else:
-            darkened = _shadowed(shadow_casters, q, sun)
+            darkened = _shadowed(shadow_casters, q, sun, sample)
     else:
         lit = 0.0
     base, tone, normal = (r, g, b), (tint[s, 0], tint[s, 1], tint[s, 2]), (wx, wy, wz)
-    polish = (table[11][s, 0], table[11][s, 1])
+    polish = (table[12][s, 0], table[12][s, 1])
     bright = _lit(base, tone, polish, normal, d, sun, lit, light)
     if darkened:
         return _lit(base, tone, polish, normal, d, sun, 0.0, light), bright
@@ -361,3 +378,36 @@ def _lit(base, tone, polish, n, d, sun, lit, light):
         gg + base[1] * tone[1] * (lit * sun_colour[1] + up * sky[1] + (1 - up) * ground[1]),
         gb + base[2] * tone[2] * (lit * sun_colour[2] + up * sky[2] + (1 - up) * ground[2]),
     )
+
+
+@kernel(inline="never")
+def reflect(mirrors, g, t, o, d, spread, atlas, light, sample, static, movers, shadow_casters, every):
+    """Compute what mirror or pane g, at distance t of the ray, reflects.
+
+    Args:
+        every: the numbers of all static shapes and of all movers.
+
+    Returns:
+        The share of the light that is reflected, the reflection with and without distractors, the owner of the
+        distractor in it, or 0.
+    """
+    axes, tint = mirrors[1], mirrors[8]
+    nx, ny, nz = axes[g, 2, 0], axes[g, 2, 1], axes[g, 2, 2]
+    along = d[0] * nx + d[1] * ny + d[2] * nz
+    r = (d[0] - 2 * along * nx, d[1] - 2 * along * ny, d[2] - 2 * along * nz)
+    lift = -2e-3 if along > 0 else 2e-3
+    q = (o[0] + t * d[0] + lift * nx, o[1] + t * d[1] + lift * ny, o[2] + t * d[2] + lift * nz)
+    share = tint[g, 0]
+    if share <= 0.0:  # a pane: Schlick 1994
+        share = GLASS + (1.0 - GLASS) * (1.0 - min(abs(along), 1.0)) ** 5
+    seen, bright, owner = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0
+    far, s = nearest(static, every[0], len(every[0]), q, r, FAR, sample[1])
+    if s >= 0:
+        wide = spread * (t + far) / far  # the footprint grows along the whole path
+        seen, bright = shade(static, s, far, q, r, wide, atlas, light, sample, static, static, shadow_casters)
+    near, m = nearest(movers, every[1], len(every[1]), q, r, far, sample[1])
+    if m >= 0:
+        wide = spread * (t + near) / near
+        seen, _ = shade(movers, m, near, q, r, wide, atlas, light, sample, static, movers, shadow_casters)
+        owner = movers[10][m]
+    return share, seen, bright, owner

@@ -18,9 +18,9 @@ from functools import reduce
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.core.srgb import linear_to_srgb
+from ambiguous_wild.core.srgb import srgb_to_linear
 from ambiguous_wild.simulate import image_effects as fx
-from ambiguous_wild.simulate.distractors import DistractorPose, movers
+from ambiguous_wild.simulate.distractors import DistractorPose, mover_shapes
 from ambiguous_wild.simulate.fixed_things import fixed_layer, laid_over
 from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.kernels import DOME
@@ -31,6 +31,7 @@ from ambiguous_wild.simulate.truth_records import DrawnEffects
 from ambiguous_wild.simulate.world import World
 
 _MAX_INSTANTS = 24  # largest number of instants of an exposure
+_CODES = srgb_to_linear((np.arange(255) + 0.5) / 255)  # linear light from which on a pixel has the next code
 FIXED = 255  # number of what is fixed to the camera, as owner of a pixel
 ImageFilter = Callable[[np.ndarray], np.ndarray]
 
@@ -52,7 +53,7 @@ class RenderedPhoto:
     photo: np.ndarray  # [H, W, 3] uint8, as stored
     clean: np.ndarray  # [H, W, 3] uint8, without distractors and moving shadow, before JPEG
     owner: np.ndarray  # [H, W] uint8: number of the first distractor in the pixel, 0 = none; or `FIXED`
-    shadow: np.ndarray | None  # [H, W] bool: darkened by a moving shadow; None: no such effect
+    shadow: np.ndarray | None  # [H, W] bool, as in `TracedPhoto`
     effects: DrawnEffects
 
 
@@ -84,9 +85,10 @@ def prepare_photo(
     """Do the steps before the rays are traced."""
     effects = spec.effects if planned.split == "train" else _lasting(spec.effects)
     drawn: DrawnEffects = {}
-    scene = _lit(effects, world, random, drawn)
+    shapes = mover_shapes(spec, planned.placements, world.plan)
+    scene = _lit(effects, world, random, drawn, shapes if spec.cast_shadows else None)
     move, camera, light = _optics(effects, planned.camera, scene.light, random, drawn)
-    distractors = movers(spec, planned.placements, world)
+    distractors = shape_table(shapes, world.atlas)
     fixed = spec.fixed if planned.split == "train" else None
     return PreparedPhoto(effects, replace(scene, light=light), camera, distractors, fixed, move, drawn)
 
@@ -95,7 +97,13 @@ def trace_photo(world: World, prepared: PreparedPhoto) -> TracedPhoto:
     """Trace the rays of one photo, on all cores."""
     scene = prepared.scene
     return trace(
-        prepared.camera, scene.static, prepared.distractors, world.atlas, scene.light, scene.shadow_casters
+        prepared.camera,
+        scene.static,
+        prepared.distractors,
+        world.atlas,
+        scene.light,
+        scene.shadow_casters,
+        shape_table(world.mirrors, world.atlas) if world.mirrors else None,
     )
 
 
@@ -137,9 +145,12 @@ def _lasting(effects: Effects) -> Effects:
     return Effects(specular=effects.specular, lens_distortion=effects.lens_distortion)
 
 
-def _lit(effects: Effects, world: World, random: PhotoRandom, drawn: DrawnEffects) -> _LitScene:
+def _lit(
+    effects: Effects, world: World, random: PhotoRandom, drawn: DrawnEffects, casters: list[Shape] | None
+) -> _LitScene:
+    """Return the static world and its light; `casters`: distractors that cast shadows on it."""
     shapes: list[Shape] = list(world.shapes)
-    light, shadow_casters = world.light, None
+    light = world.light
     if effects.time_of_day is not None:
         day = effects.time_of_day
         hour = fx.draw_time_of_day(day, random)
@@ -152,8 +163,9 @@ def _lit(effects: Effects, world: World, random: PhotoRandom, drawn: DrawnEffect
         drawn["specular"] = {}
     if effects.moving_shadow is not None:
         lobes = fx.draw_moving_shadow(effects.moving_shadow, random)
-        shadow_casters = shape_table(fx.moving_shadow(lobes, light.sun.mean(0)), world.atlas)
+        casters = [*(casters or []), *fx.moving_shadow(lobes, light.sun.mean(0))]
         drawn["moving_shadow"] = {"lobes": [list(lobe) for lobe in lobes]}
+    shadow_casters = None if casters is None else shape_table(casters, world.atlas)
     return _LitScene(shape_table(shapes, world.atlas), shadow_casters, light)
 
 
@@ -273,4 +285,5 @@ def _sensor(effects: Effects, camera: Camera, random: PhotoRandom, drawn: DrawnE
 
 
 def _to_uint8(linear: np.ndarray) -> np.ndarray:
-    return np.round(255.0 * linear_to_srgb(linear)).astype(np.uint8)
+    """Round linear light to sRGB codes, by thresholds: a power's last bit differs between processors."""
+    return np.searchsorted(_CODES, linear, side="right").astype(np.uint8)

@@ -7,6 +7,7 @@ of primitives are a lower bound, nearly exact at the surface (Quilez, "distance 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -15,13 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.simulate.kernels import BOX, BY_FACE, CAPSULE, CYLINDER, ELLIPSOID, QUAD
+from ambiguous_wild.simulate.kernels import ALWAYS, BOX, BY_FACE, CAPSULE, CYLINDER, ELLIPSOID, QUAD
 from ambiguous_wild.simulate.tracer import Atlas, ShapeTable
 
 SIZE = 64  # samples a side
 Vector = tuple[float, float, float]
 Axes = tuple[Vector, ...]
 UNSEEN = -1  # owner of an invisible shadow caster
+_HIP_M = 0.92  # height at which a figure bends
 SHEET_M = 2.0  # side of the square that an object's texture covers before it repeats mirrored
 STATUES: dict[str, Callable[[np.ndarray], np.ndarray]] = {}  # signed distance of points [..., 3], by name
 
@@ -157,6 +159,7 @@ class Shape:
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     casts: bool = True
     owner: int = 0  # 0: the static world, k: the k-th distractor, UNSEEN
+    instant: int = ALWAYS  # of the exposure at which it is there
     gloss: tuple[float, float] = (0.0, 0.0)  # strength and sharpness of the highlight
     volume: str = ""  # name of the statue, for VOLUME
 
@@ -191,6 +194,7 @@ def shape_table(shapes: Iterable[Shape], atlas: Atlas) -> ShapeTable:
         tint=np.array([s.tint for s in listed], np.float64).reshape(count, 3),
         casts=np.array([s.casts for s in listed], np.bool_),
         owner=np.array([s.owner for s in listed], np.int32),
+        instant=np.array([s.instant for s in listed], np.int32),
         gloss=np.array([s.gloss for s in listed], np.float64).reshape(count, 2),
         volume=np.array([names.index(s.volume) if s.volume else 0 for s in listed], np.int32),
         grids=grids(names),
@@ -206,14 +210,16 @@ def between(
     **more: Any,
 ) -> Shape:
     """Make a capsule (or cylinder) from one point to another."""
-    a, b = np.asarray(start, float), np.asarray(end, float)
-    z = (b - a) / np.linalg.norm(b - a)
-    x = np.cross((0.0, 1.0, 0.0) if abs(z[1]) < 0.9 else (1.0, 0.0, 0.0), z)
-    x /= np.linalg.norm(x)
-    axes = tuple(vector(row) for row in (x, np.cross(z, x), z))
-    middle = vector((a + b) / 2)
-    half = (radius, radius, float(np.linalg.norm(b - a)) / 2)
-    return Shape(kind, middle, half, texture, axes, **more)
+    a, b = vector(start), vector(end)
+    length = math.dist(a, b)
+    z = ((b[0] - a[0]) / length, (b[1] - a[1]) / length, (b[2] - a[2]) / length)
+    # perpendicular to z, and to the y or the x axis
+    side = (z[2], 0.0, -z[0]) if abs(z[1]) < 0.9 else (0.0, -z[2], z[1])
+    norm = math.hypot(*side)
+    x = (side[0] / norm, side[1] / norm, side[2] / norm)
+    y = (z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0])
+    middle = ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2, (a[2] + b[2]) / 2)
+    return Shape(kind, middle, (radius, radius, length / 2), texture, (x, y, z), **more)
 
 
 def vector(values: Iterable[float]) -> Vector:
@@ -222,26 +228,49 @@ def vector(values: Iterable[float]) -> Vector:
     return x, y, z
 
 
-def placed(shapes: Iterable[Shape], at: Sequence[float], yaw_deg: float, size: float = 1.0) -> list[Shape]:
-    """Turn shapes about z, scale them and move them to `at`, with their textures."""
-    c, s = np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg))
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def placed(
+    shapes: Iterable[Shape], at: Sequence[float], yaw_deg: float, size: float = 1.0, **more: Any
+) -> list[Shape]:
+    """Turn shapes about z, scale them and move them to `at`, with their textures; `more`: other fields to set."""
+    c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
+    left, ahead, up = vector(at)
+
+    def turned(v: Vector) -> Vector:
+        return c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
+
     moved = []
     for shape in shapes:
-        center = size * (turn @ np.asarray(shape.center)) + np.asarray(at, float)
-        axes = np.asarray(shape.axes) @ turn.T
+        x, y, z = turned(shape.center)
+        a, b, d = shape.half
         moved.append(
             replace(
                 shape,
-                center=vector(center),
-                half=vector(size * v for v in shape.half),
-                axes=tuple(vector(row) for row in axes),
+                center=(size * x + left, size * y + ahead, size * z + up),
+                half=(size * a, size * b, size * d),
+                axes=tuple(turned(row) for row in shape.axes),
+                **more,
             )
         )
     return moved
 
 
-def figure(body: str, head: str, stride: float = 0.1, lift: float = 0.0, tint: float = 1.0) -> list[Shape]:
+def bent(shapes: Iterable[Shape], angle_deg: float, hinge_m: float) -> list[Shape]:
+    """Turn shapes forwards, towards -y, about the x axis at a height."""
+    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+
+    def turned(v: Vector, hinge: float = 0.0) -> Vector:
+        up = v[2] - hinge
+        return v[0], c * v[1] - s * up, s * v[1] + c * up + hinge
+
+    return [
+        replace(shape, center=turned(shape.center, hinge_m), axes=tuple(turned(row) for row in shape.axes))
+        for shape in shapes
+    ]
+
+
+def figure(
+    body: str, head: str, stride: float = 0.1, lift: float = 0.0, tint: float = 1.0, bend_deg: float = 0.0
+) -> list[Shape]:
     """Make a standing person, 1.75 m, facing -y, feet at the origin.
 
     Args:
@@ -250,16 +279,19 @@ def figure(body: str, head: str, stride: float = 0.1, lift: float = 0.0, tint: f
         stride: half the distance between the feet, m.
         lift: height of the right arm, 0 (hanging) to 1 (pointing forward).
         tint: brightness of the legs relative to the coat.
+        bend_deg: bend of the trunk at the hip.
     """
     legs: dict[str, Any] = {"tint": (tint, tint, tint)}
     hand = (0.32, -0.12 - 0.42 * lift, 0.82 + 0.5 * lift)
     elbow = (0.34, -0.02 - 0.15 * lift, 1.12)
-    return [
+    lower = [
         between((-0.1, 0, 0.85), (-0.11, -stride, 0.09), 0.085, body, **legs),
         between((0.1, 0, 0.85), (0.11, stride, 0.09), 0.085, body, **legs),
         Shape(ELLIPSOID, (-0.11, -stride - 0.06, 0.06), (0.065, 0.15, 0.065), body, tint=(tint * 0.7,) * 3),
         Shape(ELLIPSOID, (0.11, stride - 0.06, 0.06), (0.065, 0.15, 0.065), body, tint=(tint * 0.7,) * 3),
         Shape(ELLIPSOID, (0, 0, 0.86), (0.23, 0.18, 0.34), body, offset=(0.62, 0.45)),
+    ]
+    upper = [
         Shape(ELLIPSOID, (0, 0, 1.2), (0.235, 0.155, 0.32), body),
         between((-0.2, 0, 1.4), (0.2, 0, 1.4), 0.085, body),
         between((-0.26, 0, 1.38), (-0.33, 0.03, 1.1), 0.068, body, offset=(0.35, 0.6)),
@@ -272,6 +304,7 @@ def figure(body: str, head: str, stride: float = 0.1, lift: float = 0.0, tint: f
         Shape(ELLIPSOID, (0, -0.02, 1.635), (0.093, 0.112, 0.13), head, offset=(0.4, 0.55)),
         Shape(ELLIPSOID, (0, 0.015, 1.665), (0.102, 0.112, 0.115), body, tint=(0.35 * tint,) * 3),
     ]
+    return [*lower, *(bent(upper, bend_deg, _HIP_M) if bend_deg else upper)]
 
 
 def barrier(texture: str) -> list[Shape]:

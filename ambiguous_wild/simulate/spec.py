@@ -24,7 +24,9 @@ Kind = Literal[
     "spire",
     "car",
 ]
-ThingKind = Literal["box", "ball", "column", "board", "figure", "bust", "knot", "hound", "spire", "car"]
+ThingKind = Literal[
+    "box", "ball", "column", "board", "figure", "bust", "knot", "hound", "spire", "car", "mirror", "glass"
+]
 Place = Literal["courtyard", "room", "yard"]
 FixedThing = Literal["bonnet", "stamp"]  # a car's bonnet, a burnt-in time stamp
 Ambiguity = Literal["colour", "semantic", "none"]
@@ -108,11 +110,14 @@ class Distractor:
     # factor on the natural size: figures 1.75 m, ball 0.8 m, pole 2 m, statues 1.6 m, car 4.1 m
     size: float = 1.0
     lift_m: float = 0.0  # greatest height above the ground
+    bend_deg: float = 0.0  # greatest bend of a visitor's trunk, another one in every photo
+    blur_m: float = 0.0  # length of its way, to the side that it faces, while the shutter is open
     tint: Colour = (1.0, 1.0, 1.0)  # factor on the texture, in linear light
     # elsewhere: a new place in every photo; walk: along `waypoints`; ahead: in front of the camera, which
     # follows it
     path: Literal["elsewhere", "walk", "ahead"] = "elsewhere"
-    waypoints: tuple[tuple[float, float], ...] = ()  # m: x and y of the corners of its walk
+    # m: x and y of the corners of its walk; at a single one it stands, and a visitor turns from photo to photo
+    waypoints: tuple[tuple[float, float], ...] = ()
     laps: float = 1.0  # times it walks there and back during the capture
 
 
@@ -123,7 +128,8 @@ class Thing:
     kind: ThingKind
     texture: str
     at_m: tuple[float, float, float]  # middle of its foot: x to the right, y away from the walk, z up
-    # Width, depth, height; of a statue only the height is used, of a car only the width, as its length.
+    # Width, depth, height; of a statue only the height is used, of a car only the width, as its length. A mirror
+    # and a pane of glass have a frame of the texture.
     size_m: tuple[float, float, float] = (1.0, 1.0, 1.0)
     yaw_deg: float = 0.0
     tint: Colour = (1.0, 1.0, 1.0)
@@ -250,6 +256,11 @@ class Effects:
     iso_noise: IsoNoise | None = None
     jpeg: Jpeg | None = None
 
+    @property
+    def changes_colours(self) -> bool:
+        """Whether colours differ between photos, as a whole."""
+        return any((self.time_of_day, self.exposure_drift, self.white_balance))
+
 
 @dataclass(frozen=True)
 class CaptureSpec:
@@ -276,4 +287,11 @@ class CaptureSpec:
     world: WorldSpec = field(default_factory=WorldSpec)
     effects: Effects = field(default_factory=Effects)
     fixed: FixedThing | None = None  # fixed to the camera, in every train photo, on top of `occlusion`
+    cast_shadows: bool = False  # of distractors on the scene; else what is outside of them equals the clean photo
     designed: Designed = field(default_factory=Designed)
+
+    @property
+    def has_shadows(self) -> bool:
+        """Whether photos may change outside of distractors: by shadows, or by reflections in panes."""
+        panes = any(thing.kind == "glass" for thing in self.world.things)
+        return self.cast_shadows or panes or self.effects.moving_shadow is not None

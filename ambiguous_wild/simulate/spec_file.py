@@ -55,6 +55,8 @@ _DISTRACTOR: Limits = {
     "size": (0.02, 10),
     "presence": (0, 1),
     "lift_m": (0, 3),
+    "bend_deg": (0, 100),
+    "blur_m": (0, 1),
     "laps": (0, 100),
     "distance_m": (0.3, 12),
     "tint": (0, 4),
@@ -229,8 +231,10 @@ def _distractor(where: str, d: Distractor, plan: GroundPlan) -> None:
             raise AwError(f"{where}head: only a visitor has one, not a {d.kind}")
         _texture(f"{where}head", d.head, TEXTURES)
     _within(where, d, _DISTRACTOR)
-    if d.path == "walk" and len(d.waypoints) < 2:
-        raise AwError(f"{where}waypoints: a walk needs two corners or more, [[x, y], [x, y]] in metres")
+    if d.path == "walk" and not d.waypoints:
+        raise AwError(f"{where}waypoints: a walk needs corners, [[x, y], [x, y]] in metres; one to stand there")
+    if d.bend_deg and d.kind != "visitor":
+        raise AwError(f"{where}bend_deg: only a visitor bends, not a {d.kind}")
     if d.path != "walk" and d.waypoints:
         raise AwError(f"{where}waypoints: only read with 'path: walk'; add that or leave them out")
     if d.path != "walk" and d.laps != Distractor.laps:

@@ -1,7 +1,8 @@
 """Textures made of photographs in scikit-image, without repetition.
 
 In a tiled photograph COLMAP would match a brick with its copy; blended layers and noise make every square
-metre different.
+metre different. All is computed in float64 and stored as float32: float32 powers and blurs differ in their last
+bit between processors, which would change pixels.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ Colour = tuple[float, float, float]  # linear light
 
 @cache
 def photograph(name: str) -> np.ndarray:
-    """Read a photograph of scikit-image, [H, W, 3] float32 in [0, 1], sRGB; read-only.
+    """Read a photograph of scikit-image, [H, W, 3] float64 in [0, 1], sRGB; read-only.
 
     Raises:
         AwError: this scikit-image has no such file.
@@ -48,15 +49,20 @@ def photograph(name: str) -> np.ndarray:
             f"texture {path.name} is not in scikit-image {version('scikit-image')} at {path.parent}: "
             "the wheels of 0.24 to 0.26 carry it; install one of those"
         )
-    rgb = np.ascontiguousarray(image[:, :, ::-1]).astype(np.float32) / 255.0
+    rgb = np.ascontiguousarray(image[:, :, ::-1]) / 255.0
     rgb.setflags(write=False)
     return rgb
 
 
+def uniform(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Draw float64 numbers in [0, 1), of which float32 holds every bit."""
+    return rng.random(shape, dtype=np.float32).astype(np.float64)
+
+
 def noise(rng: np.random.Generator, height: int, width: int, cell_px: float) -> np.ndarray:
-    """Smooth value noise, [H, W] float32 in [0, 1]: a random grid of `cell_px` cells, cubic interpolation."""
+    """Smooth value noise, [H, W] in [0, 1]: a random grid of `cell_px` cells, cubic interpolation."""
     rows, cols = int(np.ceil(height / cell_px)) + 3, int(np.ceil(width / cell_px)) + 3
-    grid = rng.random((rows, cols), dtype=np.float32)
+    grid = uniform(rng, rows, cols)
     size = (round(cols * cell_px), round(rows * cell_px))
     smooth = cv2.resize(grid, size, interpolation=cv2.INTER_CUBIC)
     start = round(cell_px)
@@ -64,8 +70,8 @@ def noise(rng: np.random.Generator, height: int, width: int, cell_px: float) -> 
 
 
 def octaves(rng: np.random.Generator, height: int, width: int, cell_px: float, count: int = 4) -> np.ndarray:
-    """Value noise at `count` scales, halving in size, 0.6 in strength; [H, W] float32 in [0, 1]."""
-    total = np.zeros((height, width), np.float32)
+    """Value noise at `count` scales, halving in size, 0.6 in strength; [H, W] in [0, 1]."""
+    total = np.zeros((height, width))
     weight = 0.0
     for k in range(count):
         if cell_px / 2**k < 2:
@@ -73,8 +79,8 @@ def octaves(rng: np.random.Generator, height: int, width: int, cell_px: float, c
         total += noise(rng, height, width, cell_px / 2**k) * 0.6**k
         weight += 0.6**k
     if weight == 0.0:  # the noise is finer than the texture, so only its mean is left
-        return np.full((height, width), 0.5, np.float32)
-    return np.asarray(total / weight, dtype=np.float32)
+        return np.full((height, width), 0.5)
+    return total / weight
 
 
 def step(low: float, high: float, x: np.ndarray) -> np.ndarray:
@@ -96,7 +102,7 @@ def laid(
     """The photograph's brightness laid over a surface, mirrored at its seams: [H, W, 1], mean 1."""
     scale = photograph(name).shape[1] / (tile_m * px_per_m)
     grey = _brightness(name, max(scale, 1.0))
-    v, u = np.mgrid[0:height, 0:width].astype(np.float32)
+    v, u = np.mgrid[0:height, 0:width]
     c, s = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
     x = (c * u - s * v) * scale + float(shift[0]) * grey.shape[1]
     y = (s * u + c * v) * scale + float(shift[1]) * grey.shape[0]
@@ -132,7 +138,7 @@ def gravel_ground(rng: np.random.Generator, width_m: float, height_m: float, px_
     paving = paving * tint(rng, h, w, px_per_m, (0.3, 0.27, 0.25), 0.5)
     patches = octaves(rng, h, w, 1.6 * px_per_m, 6)
     ground = stones + (lawn - stones) * step(0.52, 0.6, patches)
-    x = (np.arange(w, dtype=np.float32) / px_per_m - width_m / 2)[None]
+    x = (np.arange(w) / px_per_m - width_m / 2)[None]
     bend, ragged = octaves(rng, h, w, 1.6 * px_per_m) - 0.5, octaves(rng, h, w, 0.2 * px_per_m, 3) - 0.5
     edge = np.abs(x + 0.3 + 1.6 * bend) + 0.35 * ragged
     return np.asarray(ground + (paving - ground) * (1 - step(0.75, 0.85, edge)), dtype=np.float32)
@@ -146,8 +152,8 @@ def tint(
     fine = octaves(rng, h, w, 0.25 * px_per_m, 3) - 0.5
     hue = octaves(rng, h, w, 0.8 * px_per_m) - 0.5
     value = np.clip(1 + strength * (2 * wide + fine), 0.2, 2.0)[..., None]
-    turn = 1 + 0.5 * hue[..., None] * np.array([1, 0, -1], np.float32)
-    return np.asarray(np.array(colour, np.float32) * value * turn)
+    turn = 1 + 0.5 * hue[..., None] * np.array([1, 0, -1])
+    return np.asarray(np.array(colour) * value * turn)
 
 
 def brick_wall(
@@ -165,15 +171,15 @@ def brick_wall(
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     courses = laid("brick", h, w, px_per_m, 1.9, 90.0, rng.random(2)) ** 1.2
     wall = courses * tint(rng, h, w, px_per_m, colour, 0.55)
-    height = (np.arange(h, dtype=np.float32) / px_per_m)[:, None]
+    height = (np.arange(h) / px_per_m)[:, None]
     fallen = octaves(rng, h, w, 1.1 * px_per_m, 6) - (0.0 if foot else 0.2)
     plaster = scattered("gravel", rng, h, w, px_per_m, 5.0) ** 0.35
     plaster = plaster * tint(rng, h, w, px_per_m, (0.46, 0.4, 0.3), 0.25)
     wall = wall + (plaster - wall) * step(0.585, 0.605, fallen)
-    moss = scattered("grass", rng, h, w, px_per_m, 1.2) * np.array([0.09, 0.13, 0.04], np.float32)
+    moss = scattered("grass", rng, h, w, px_per_m, 1.2) * np.array([0.09, 0.13, 0.04])
     damp = octaves(rng, h, w, 0.6 * px_per_m, 5) + (0.35 * np.exp(-height / 0.4) - 0.05 if foot else -0.2)
     wall = wall + 0.85 * (moss - wall) * step(0.58, 0.68, damp)
-    streaks = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 2.0, sigmaY=0.5 * px_per_m) - 0.5
+    streaks = cv2.GaussianBlur(uniform(rng, h, w), (0, 0), 2.0, sigmaY=0.5 * px_per_m) - 0.5
     soot = 1 + 6.0 * streaks * np.clip(height / height_m, 0, 1)
     return np.asarray(wall * np.clip(soot, 0.5, 1.4)[..., None], dtype=np.float32)
 
@@ -183,9 +189,9 @@ def stone(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: f
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     grain = scattered("gravel", rng, h, w, px_per_m, 0.9) ** 0.7
     body = grain * tint(rng, h, w, px_per_m * 0.3, (0.40, 0.36, 0.28), 0.4)
-    lichen = grain * np.array([0.26, 0.26, 0.15], np.float32)
+    lichen = grain * np.array([0.26, 0.26, 0.15])
     body = body + 0.7 * (lichen - body) * step(0.6, 0.7, octaves(rng, h, w, 0.2 * px_per_m, 6))
-    runs = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 1.5, sigmaY=0.1 * px_per_m) - 0.5
+    runs = cv2.GaussianBlur(uniform(rng, h, w), (0, 0), 1.5, sigmaY=0.1 * px_per_m) - 0.5
     dark = step(0.52, 0.75, octaves(rng, h, w, 0.25 * px_per_m, 6) + 1.5 * runs)
     return np.asarray(body * (1 - 0.55 * dark), dtype=np.float32)
 
@@ -203,8 +209,8 @@ def timber(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: 
     """Boards: the brick photograph's long edges stretched into planks, streaked along the grain."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     board = (np.arange(h) / (0.14 * px_per_m)).astype(int)
-    tone = (0.7 + 0.6 * rng.random(board.max() + 1)).astype(np.float32)[board][:, None]
-    grain = cv2.GaussianBlur(rng.random((h, w), dtype=np.float32), (0, 0), 0.12 * px_per_m, sigmaY=0.8) - 0.5
+    tone = (0.7 + 0.6 * rng.random(board.max() + 1))[board][:, None]
+    grain = cv2.GaussianBlur(uniform(rng, h, w), (0, 0), 0.12 * px_per_m, sigmaY=0.8) - 0.5
     joint = np.abs((np.arange(h) / (0.14 * px_per_m)) % 1.0 - 0.5)[:, None] > 0.46
     value = tone * (1 + 4.0 * grain) * np.where(joint, 0.25, 1.0)
     rough = scattered("gravel", rng, h, w, px_per_m, 2.0) ** 0.5
@@ -214,12 +220,13 @@ def timber(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: 
 
 def clay(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
     """Fired clay, [H, W, 3] linear light."""
-    return stone(rng, width_m, height_m, px_per_m) * np.array([1.0, 0.5, 0.3], np.float32)
+    return stone(rng, width_m, height_m, px_per_m) * np.array([1.0, 0.5, 0.3])
 
 
 def skin(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
     """Even, slightly mottled skin, [H, W, 3] linear light."""
-    return stone(rng, width_m, height_m, px_per_m) ** 0.3 * np.array([0.62, 0.42, 0.32], np.float32)
+    even = stone(rng, width_m, height_m, px_per_m).astype(np.float64) ** 0.3
+    return np.asarray(even * np.array([0.62, 0.42, 0.32]), dtype=np.float32)
 
 
 def brick(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
@@ -237,8 +244,8 @@ def gravel(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: 
 def vivid(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
     """Bands of magenta, cyan and yellow, which the world has nowhere else, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    colours = np.array([[0.75, 0.03, 0.4], [0.02, 0.45, 0.75], [0.85, 0.6, 0.02]], np.float32)
-    wave = np.arange(w, dtype=np.float32)[None] / px_per_m + 0.4 * octaves(rng, h, w, 0.3 * px_per_m, 3)
+    colours = np.array([[0.75, 0.03, 0.4], [0.02, 0.45, 0.75], [0.85, 0.6, 0.02]])
+    wave = np.arange(w)[None] / px_per_m + 0.4 * octaves(rng, h, w, 0.3 * px_per_m, 3)
     band = (wave / 0.16).astype(int) % 3
     grain = scattered("gravel", rng, h, w, px_per_m, 1.5) ** 0.25
     return np.asarray(colours[band] * grain, dtype=np.float32)
@@ -254,11 +261,11 @@ def cloth(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: f
 
 def sky(rng: np.random.Generator, height: int = 512, width: int = 2048) -> np.ndarray:
     """The background: trees, haze, clouds; row 0 is the horizon."""
-    elevation = np.linspace(0.0, np.pi / 2, height, dtype=np.float32)[:, None]
-    blue = np.array([0.20, 0.36, 0.66], np.float32) * (1 - 0.35 * elevation[..., None])
-    haze = np.array([0.52, 0.56, 0.62], np.float32)
+    elevation = np.linspace(0.0, np.pi / 2, height)[:, None]
+    blue = np.array([0.20, 0.36, 0.66]) * (1 - 0.35 * elevation[..., None])
+    haze = np.array([0.52, 0.56, 0.62])
     image = blue + (haze - blue) * np.exp(-elevation / 0.25)[..., None]
-    image = image + (np.array([0.74, 0.73, 0.71], np.float32) - image) * step(
+    image = image + (np.array([0.74, 0.73, 0.71]) - image) * step(
         0.42, 0.7, _round(octaves(rng, height, width // 2, 110.0, 7))
     )
     image = image * (0.8 + 0.4 * _round(octaves(rng, height, width // 2, 60.0, 5)))[..., None]
@@ -266,7 +273,7 @@ def sky(rng: np.random.Generator, height: int = 512, width: int = 2048) -> np.nd
     ragged = _round(octaves(rng, height, width // 2, 12.0, 3))
     line = 0.12 + 0.9 * (crowns - 0.25) + 0.16 * (ragged - 0.5)
     light = (0.2 + 1.6 * _round(octaves(rng, height, width // 2, 30.0, 5)) ** 2)[..., None]
-    leaves = light * np.array([0.10, 0.15, 0.05], np.float32)
+    leaves = light * np.array([0.10, 0.15, 0.05])
     trees = 1 - step(-0.004, 0.004, elevation - line)
     return np.asarray(image + (leaves - image) * trees, dtype=np.float32)
 
@@ -282,4 +289,4 @@ def poster(name: str) -> np.ndarray:
     scale = 512 / image.shape[1]
     resized = cv2.resize(image, (512, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
     framed = cv2.copyMakeBorder(resized, 18, 18, 18, 18, cv2.BORDER_CONSTANT, value=(0.93, 0.92, 0.88))
-    return srgb_to_linear(framed[::-1]).astype(np.float32) * np.float32(0.85)
+    return np.asarray(0.85 * srgb_to_linear(framed[::-1]), dtype=np.float32)

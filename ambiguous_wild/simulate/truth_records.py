@@ -6,6 +6,8 @@ from typing import NotRequired, TypedDict
 
 import numpy as np
 
+from ambiguous_wild.core.scene import Evaluation
+
 Summary = dict[str, float]  # mean, min and max of a figure over the training photos
 
 
@@ -68,6 +70,7 @@ class CaptureTruth(TypedDict):
     occlusion: Summary
     photos: dict[str, PhotoTruth]
     licence: str
+    evaluation: NotRequired[Evaluation]  # of captures whose photos differ in colour
     files: NotRequired[dict[str, str]]  # path -> sha256, added last
 
 

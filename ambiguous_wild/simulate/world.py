@@ -28,11 +28,23 @@ from ambiguous_wild.simulate.kernels import (
     QUAD,
     VOLUME,
 )
-from ambiguous_wild.simulate.shapes import SHEET_M, Axes, Shape, between, figure, placed, shape_table, vector
+from ambiguous_wild.simulate.shapes import (
+    SHEET_M,
+    Axes,
+    Shape,
+    Vector,
+    between,
+    figure,
+    placed,
+    shape_table,
+    vector,
+)
 from ambiguous_wild.simulate.spec import POSTERS, STATUES, GroundPlan, Thing, WorldSpec
 from ambiguous_wild.simulate.tracer import Atlas, Light, ShapeTable, build_atlas
 
 OVERHEAD_M = 2.0  # foot of a thing that hangs above the distractors
+MIRRORS = {"mirror": 0.85, "glass": 0.0}  # share of the light that is mirrored; of a pane it follows the angle
+FRAME_M = 0.05  # width of the frame of a mirror or a pane
 SHEETS = {
     "stone": tx.stone, "foliage": tx.foliage, "timber": tx.timber, "clay": tx.clay, "skin": tx.skin,
     "brick": tx.brick, "gravel": tx.gravel, "vivid": tx.vivid, "cloth": tx.cloth, "plaster": built.plaster,
@@ -77,9 +89,9 @@ def placard(texture: str, plan: GroundPlan) -> list[Shape]:
     return [board(texture, 1.1, 0.85, 0.03, plan, 0.75), *sticks]
 
 
-def car(texture: str, length_m: float = 4.1) -> list[Shape]:
-    """Make a small car at the origin that faces +x: body, glass, wheels, lamps."""
-    return placed(parts_of("car", texture), (0, 0, 0), 0.0, length_m / 4.1)
+def car(texture: str, length_m: float = 4.1, paint: Vector = (1.0, 1.0, 1.0)) -> list[Shape]:
+    """Make a small car at the origin that faces +x: body in a tint of the texture, glass, wheels, lamps."""
+    return placed(parts_of("car", texture, paint), (0, 0, 0), 0.0, length_m / 4.1)
 
 
 @cache
@@ -87,12 +99,14 @@ def _objects() -> dict[str, list[dict[str, Any]]]:
     return plain_yaml.read_mapping(Path(__file__).with_name("objects.yaml"))
 
 
-def parts_of(name: str, texture: str = "") -> list[Shape]:
-    """Make an object of `objects.yaml` at the origin; parts without a texture get `texture`."""
+def parts_of(name: str, texture: str = "", own_tint: Vector = (1.0, 1.0, 1.0)) -> list[Shape]:
+    """Make an object of `objects.yaml` at the origin; parts without a texture of their own get these."""
     shapes = []
     for part in _objects()[name]:
         shown = texture if part["texture"] == "own" else part["texture"]
         more: dict[str, Any] = {key: tuple(part[key]) for key in ("offset", "tint", "gloss") if key in part}
+        if part["texture"] == "own":
+            more["tint"] = own_tint
         if "from" in part:
             kind = CAPSULE if part["shape"] == "rod" else CYLINDER
             shapes.append(between(part["from"], part["to"], part["radius"], shown, kind, **more))
@@ -100,6 +114,33 @@ def parts_of(name: str, texture: str = "") -> list[Shape]:
             kind = BOX if part["shape"] == "box" else ELLIPSOID
             shapes.append(Shape(kind, tuple(part["at"]), tuple(part["half"]), shown, **more))
     return shapes
+
+
+def mirror_of(thing: Thing) -> Shape:
+    """Make the mirror or the pane of a thing, which faces -y before it is turned."""
+    width, depth, height = thing.size_m
+    front = -depth / 2 - 0.002 if thing.kind == "mirror" else 0.0
+    axes: Axes = ((1, 0, 0), (0, 0, 1), (0, -1, 0))
+    share = MIRRORS[thing.kind]
+    half = (width / 2 - FRAME_M, height / 2 - FRAME_M, 0.0)
+    shape = Shape(QUAD, (0.0, front, height / 2), half, thing.texture, axes, tint=(share, share, share))
+    return placed([shape], thing.at_m, thing.yaw_deg)[0]
+
+
+def _frame(thing: Thing) -> list[Shape]:
+    """Make the frame of a mirror or a pane, and the back of a mirror."""
+    width, depth, height = thing.size_m
+    wide, high, thick = width / 2, height / 2, FRAME_M / 2
+    bars = [((x, 0, high), (thick, high)) for x in (thick - wide, wide - thick)]
+    bars += [((0, 0, z), (wide, thick)) for z in (thick, height - thick)]
+    # The frame stands out by a centimetre in front of the mirror.
+    parts = [
+        Shape(BOX, vector(at), (half[0], depth / 2 + 0.01, half[1]), thing.texture, offset=(0.3 * k, 0.5))
+        for k, (at, half) in enumerate(bars)
+    ]
+    if thing.kind == "mirror":
+        parts.append(Shape(BOX, (0, 0, high), (wide - thick, depth / 2, high - thick), thing.texture))
+    return parts
 
 
 def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
@@ -114,12 +155,14 @@ def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
     elif thing.kind == "board":
         parts = [board(thing.texture, width, height, depth, plan)]
     elif thing.kind == "car":
-        parts = car(thing.texture, width)
+        parts = car(thing.texture, width, thing.tint)
+    elif thing.kind in MIRRORS:
+        parts = _frame(thing)
     elif thing.kind == "column":
         parts = [between((0, 0, 0), (0, 0, height), width / 2, thing.texture, CYLINDER)]
     else:
         parts = [Shape(ELLIPSOID if thing.kind == "ball" else BOX, middle, half, thing.texture)]
-    tint = thing.tint
+    tint = (1.0, 1.0, 1.0) if thing.kind == "car" else thing.tint
     # Each object shows another part of its texture, so that two of the same stone differ.
     shift = (0.37 * thing.at_m[0], 0.29 * thing.at_m[1])
     parts = [
@@ -127,7 +170,7 @@ def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
             s,
             tint=(s.tint[0] * tint[0], s.tint[1] * tint[1], s.tint[2] * tint[2])
             if s.texture == thing.texture
-            else s.tint,  # glass and tyres of a car
+            else s.tint,
             offset=s.offset if thing.kind == "board" else (s.offset[0] + shift[0], s.offset[1] + shift[1]),
         )
         for s in parts
@@ -155,6 +198,7 @@ class World:
     keep_out: np.ndarray  # [N, 3] float64: x, y, radius in m
     hub: tuple[float, float, float]  # m: point on the ground that the cameras walk around
     plan: GroundPlan
+    mirrors: tuple[Shape, ...] = ()  # mirrors and panes
 
     def table(self) -> ShapeTable:
         """Return the static shapes as a table for the ray caster."""
@@ -177,7 +221,8 @@ def world_of(
     _shade_feet(textures["ground"], circles, detail_px_per_m, plan)
     keep_out = np.array(circles, float).reshape(-1, 3)
     shapes = (*_ground_and_sky(plan), *shapes, *things)
-    return World(shapes, build_atlas(textures), light, keep_out, hub, plan)
+    mirrors = tuple(mirror_of(thing) for thing in what.things if thing.kind in MIRRORS)
+    return World(shapes, build_atlas(textures), light, keep_out, hub, plan, mirrors)
 
 
 def baked_sheets(rng: np.random.Generator, detail_px_per_m: float) -> Callable[[], dict[str, np.ndarray]]:
@@ -274,8 +319,8 @@ def _shade_feet(
 ) -> None:
     """Darken the ground at the foot of walls and objects, in place and without tracing rays."""
     h, w = ground.shape[:2]
-    x = (np.arange(w, dtype=np.float32) + 0.5) / px_per_m - plan.ground_m[0] / 2
-    y = (np.arange(h, dtype=np.float32) + 0.5) / px_per_m - plan.ground_m[1] / 2
+    x = (np.arange(w) + 0.5) / px_per_m - plan.ground_m[0] / 2
+    y = (np.arange(h) + 0.5) / px_per_m - plan.ground_m[1] / 2
     for cx, cy, radius in circles:
         away = np.hypot(x[None] - cx, y[:, None] - cy) - 0.7 * radius
         ground *= (1 - 0.5 * np.exp(-np.maximum(away, 0) / 0.18))[..., None]

@@ -100,10 +100,11 @@ def _tree(rng: np.random.Generator) -> list[Shape]:
     shapes = [between((0, 0, 0), (0.08, 0.04, height), 0.13, "timber", offset=(0.4, 0.1))]
     for _ in range(4):
         a = rng.uniform(0, 2 * np.pi)
-        reach = (0.08 + 0.8 * np.cos(a), 0.04 + 0.8 * np.sin(a), height + rng.uniform(0.5, 1.0))
+        reach = (0.08 + 0.5 * np.cos(a), 0.04 + 0.5 * np.sin(a), height + rng.uniform(0.5, 1.0))
         shapes.append(between((0.08, 0.04, height - 0.2), reach, 0.05, "timber"))
     for _ in range(16):
-        at = np.array([0.08, 0.04, height + 1.0]) + rng.normal(0, 1, 3) * (0.6, 0.6, 0.5)
+        # No leaves float apart from the crown.
+        at = np.array([0.08, 0.04, height + 1.0]) + np.clip(rng.normal(0, 1, 3), -1.2, 1.2) * (0.6, 0.6, 0.5)
         size = rng.uniform(0.35, 0.65, 3)
         offset = (float(rng.random()), float(rng.random()))
         shapes.append(Shape(ELLIPSOID, vector(at), vector(size), "foliage", offset=offset))

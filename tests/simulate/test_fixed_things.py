@@ -96,7 +96,8 @@ def test_a_scene_has_poses_already(tmp_path: Path) -> None:
 
 
 def test_the_preset_has_it_in_train_photos_with_exact_masks(tmp_path: Path) -> None:
-    spec = replace(resized(PRESETS["bonnet"], views=3, width=96), detail_px_per_m=5.0, samples=1)
+    spec = resized(PRESETS["bonnet"], views=3, width=96)
+    spec = replace(spec, detail_px_per_m=5.0, samples=1, distractors=(), occlusion=(0.0, 0.0))
     facts = simulate(spec, tmp_path / "raw")
     masks = [read_gray(p) for p in sorted((tmp_path / "raw/truth/distractor").iterdir())]
     assert len(masks) == 3 and all(np.array_equal(mask, masks[0]) for mask in masks)

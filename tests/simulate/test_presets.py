@@ -25,9 +25,8 @@ from ambiguous_wild.simulate.world import World
 STATED = {
     "courtyard": (0.14, 0.22),
     "courtyard-plain": (0.16, 0.24),
-    "courtyard-thin": (0.04, 0.09),
-    "courtyard-sparse": (0.035, 0.065),
-    "courtyard-crowd": (0.41, 0.49),
+    "sticks": (0.05, 0.1),
+    "crowd": (0.45, 0.6),
 }
 THIN = ("pole", "barrier", "banner")
 VIDEOS = [name for name, spec in PRESETS.items() if spec.walk in VIDEO_WALKS]
@@ -59,14 +58,14 @@ def test_distractors_cover_the_stated_share_of_a_photo(name: str) -> None:
 
 
 def test_a_seed_repeats_and_another_does_not() -> None:
-    spec = small("courtyard-thin", views=3, width=96)
+    spec = small("sticks", views=3, width=96)
     first, again, other = masks(spec, 2), masks(spec, 2), masks(spec, 3)
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
 @cache
 def empty() -> tuple[CaptureSpec, World]:
-    spec = small("courtyard-clean", views=3)
+    spec = small("still", views=3)
     return spec, capture_writer.plan(spec, 0)[0]
 
 
@@ -90,7 +89,7 @@ def width_m(distractor: Distractor) -> float:
 
 
 def test_what_is_called_thin_is_thin() -> None:
-    thin = PRESETS["courtyard-thin"].distractors
+    thin = PRESETS["sticks"].distractors
     assert {d.kind for d in thin} == {*THIN, "ball"}
     for d in thin:
         limit = 0.1 if d.kind in ("pole", "barrier") else 0.25
@@ -101,7 +100,7 @@ def test_what_is_called_thin_is_thin() -> None:
 
 def test_a_thin_one_reaches_far_across_the_photo() -> None:
     """Thin, not small: its mask is at least six times as long as it is wide."""
-    for d in PRESETS["courtyard-thin"].distractors:
+    for d in PRESETS["sticks"].distractors:
         if d.kind in THIN:
             mask, px_per_m = only(d)
             rows, columns = np.nonzero(mask)

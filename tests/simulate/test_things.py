@@ -125,6 +125,31 @@ def test_a_walker_keeps_to_its_way_and_speed() -> None:
     assert 0 < sum(bool(p) for p in placed) < 9
 
 
+def test_who_stands_keeps_its_place_and_a_visitor_turns_and_bends() -> None:
+    visitor = Distractor("v", "visitor", "cloth", "none", presence=1.0, distance_m=(0.3, 6.0), bend_deg=80.0,
+                         path="walk", waypoints=((-1.0, -1.0),))  # fmt: skip
+    bust = replace(visitor, name="b", kind="bust", bend_deg=0.0, waypoints=((1.0, -1.0),))
+    spec = replace(
+        resized(preset("walkers"), views=9, width=64), distractors=(visitor, bust), detail_px_per_m=6.0, samples=1
+    )
+    _, shots = capture_writer.plan(spec, 0)
+    placements = [shot.placements for shot in shots[:9]]
+    for which, x, turns in ((0, -1.0, 9), (1, 1.0, 1)):
+        of = [p for group in placements for p in group if p.which == which]
+        assert {(p.x_m, p.y_m) for p in of} == {(x, -1.0)} and len(of) == 9
+        assert len({p.yaw_deg for p in of}) == len({p.pose for p in of}) == turns
+
+
+def test_a_bent_figure_has_its_head_where_the_turn_about_its_hip_puts_it() -> None:
+    upright, bowed = shapes.figure("cloth", "skin"), shapes.figure("cloth", "skin", bend_deg=90.0)
+    feet, head = slice(0, 4), [k for k, s in enumerate(upright) if s.center[2] > 1.6]
+    assert upright[feet] == bowed[feet] and len(head) == 2
+    for k in head:  # at a right angle, what was above the hip lies in front of it
+        x, y, z = upright[k].center
+        hip = 0.92
+        assert bowed[k].center == pytest.approx((x, -(z - hip), hip + y))
+
+
 def test_one_whom_the_camera_follows_sways_in_front_of_it_and_is_seen_from_behind() -> None:
     spec = replace(resized(preset("followed"), width=64), detail_px_per_m=6.0, samples=1)
     _, shots = capture_writer.plan(spec, 0)

@@ -158,3 +158,95 @@ def test_the_kernels_that_are_compiled_ahead_are_those_of_a_capture():
     random = PhotoRandom(0, 0, 0.0)
     trace_photo(world, prepare_photo(spec, world, photos[0], random))
     assert len(tracer._tiles.signatures) == 1
+
+
+GREY = {name: np.full((2, 2, 3), level, np.float32) for name, level in (("light", 0.8), ("dark", 0.05))}
+FACING = ((1, 0, 0), (0, 0, 1), (0, -1, 0))  # axes of what faces -y
+EVEN = Light(np.tile([0.0, 0.0, 1.0], (4, 1)), np.zeros(3), np.ones(3), np.ones(3))  # the same from everywhere
+
+
+def _ahead(width: int = 120, height: int = 90) -> Camera:
+    pose = look_at(np.array([0.0, -5.0, 1.0]), np.array([0.0, 0.0, 1.0]), 0.0)
+    return Camera(width, height, 100.0, 100.0, width / 2, height / 2, pose)
+
+
+def test_a_mirror_shows_what_stands_behind_it_in_a_reflected_world() -> None:
+    """A ball in front of the mirror in y = 0 is seen in it as one at the reflected place is without a mirror."""
+    atlas = build_atlas(GREY)
+    back = Shape(QUAD, (0, 6.0, 1), (30, 30, 0), "dark", FACING, PLANAR)
+    front = replace(back, center=(0, -6.0, 1), axes=((1, 0, 0), (0, 0, -1), (0, 1, 0)))
+    ball = Shape(ELLIPSOID, (0.9, -2.0, 1.3), (0.5, 0.5, 0.5), "light", owner=1)
+    quad = Shape(QUAD, (0, 0, 1), (2.0, 1.5, 0), "dark", FACING, tint=(0.85,) * 3)
+    mirrored = trace(
+        _ahead(), shape_table([back, front], atlas), shape_table([ball], atlas), atlas, EVEN, None,
+        shape_table([quad], atlas),
+    )  # fmt: skip
+    reflected = replace(ball, center=(0.9, 2.0, 1.3), owner=2)
+    alone = trace(_ahead(), shape_table([back], atlas), shape_table([reflected, ball], atlas), atlas, EVEN)
+    np.testing.assert_array_equal(mirrored.owner > 0, alone.owner > 0)  # itself and its image
+    image = alone.owner == 2
+    assert 100 < image.sum() and mirrored.shadow is None
+    inner = image & (np.roll(image, 1, 0) & np.roll(image, -1, 0) & np.roll(image, 1, 1) & np.roll(image, -1, 1))
+    assert mirrored.distracted[inner] == pytest.approx(0.85 * alone.distracted[inner], rel=1e-5)
+    assert mirrored.clean[inner] == pytest.approx(0.85 * alone.clean[inner], rel=1e-5)
+    assert mirrored.depth_m[45, 60] == pytest.approx(5.0, abs=0.01) and alone.depth_m[45, 60] > 10
+
+
+def test_a_pane_adds_what_it_reflects_and_only_what_changes_is_shadow() -> None:
+    atlas = build_atlas(GREY)
+    back = Shape(QUAD, (0, 6.0, 1), (30, 30, 0), "light", FACING, PLANAR)
+    front = replace(back, texture="dark", center=(0, -6.0, 1), axes=((1, 0, 0), (0, 0, -1), (0, 1, 0)))
+    behind = Shape(ELLIPSOID, (-0.8, 1.5, 1.0), (0.4, 0.4, 0.4), "dark", owner=1)
+    before = Shape(ELLIPSOID, (0.6, -2.0, 1.3), (0.4, 0.4, 0.4), "light", owner=2)
+    pane = shape_table([Shape(QUAD, (0, 0, 1), (2.0, 1.5, 0), "dark", FACING, tint=(0.0,) * 3)], atlas)
+    static, people = shape_table([back, front], atlas), shape_table([behind, before], atlas)
+    seen = trace(_ahead(), static, people, atlas, EVEN, None, pane)
+    open_air = trace(_ahead(), static, people, atlas, EVEN)
+    np.testing.assert_array_equal(seen.owner, open_air.owner)  # the reflection of a distractor is none
+    rays = np.stack(np.meshgrid((np.arange(120) + 0.5 - 60) / 100, (np.arange(90) + 0.5 - 45) / 100), -1)
+    share = 0.08 + 0.92 * (1 - 1 / np.sqrt(1 + (rays**2).sum(-1))) ** 5  # Schlick 1994
+    inside = (np.abs(rays[..., 0]) < 0.38) & (np.abs(rays[..., 1]) < 0.28)
+    plain = inside & (seen.owner == 0) & ~seen.shadow
+    dark, light = 0.05, 0.8  # under light of 1 from everywhere
+    expected = (1 - share) * light + share * dark
+    assert seen.clean[inside][:, 0] == pytest.approx(expected[inside], abs=2e-4)
+    np.testing.assert_array_equal(seen.distracted[plain], seen.clean[plain])
+    assert 50 < seen.shadow.sum() < 2000  # the image of the light ball
+    hidden = (open_air.owner == 1) & inside & ~seen.shadow
+    assert np.median(seen.distracted[hidden][:, 0]) == pytest.approx(dark, abs=2e-3)  # behind: 0.92 + 0.08 of it
+    assert open_air.shadow is None
+
+
+def test_who_moves_during_the_exposure_is_there_at_each_instant_for_a_quarter_of_it() -> None:
+    atlas = build_atlas(GREY)
+    back = shape_table([Shape(QUAD, (0, 6.0, 1), (30, 30, 0), "dark", FACING, PLANAR)], atlas)
+    x = np.array([-0.3, -0.1, 0.1, 0.3])
+    posts = [Shape(BOX, (at, -2.0, 1.0), (0.3, 0.05, 0.5), "light", owner=1, instant=k) for k, at in enumerate(x)]
+    seen = trace(_ahead(), back, shape_table(posts, atlas), atlas, EVEN)
+    row = seen.distracted[45, :, 0]
+    centres = (np.arange(120) + 0.5 - 60) / 100 * 2.95  # m at the posts' front
+    count = (np.abs(centres[:, None] - x) < 0.3).sum(1)
+    edge = (np.abs(np.abs(centres[:, None] - x) - 0.3) < 0.04).any(1)
+    assert row[~edge] == pytest.approx((0.05 + (0.8 - 0.05) * count / 4)[~edge], abs=1e-4)
+    np.testing.assert_array_equal(seen.owner[45][~edge] > 0, count[~edge] > 0)
+    assert set(count[~edge]) == {0, 1, 2, 3, 4} or set(count[~edge]) >= {0, 2, 4}
+
+
+def test_shadows_of_distractors_darken_what_the_truth_says_and_nothing_else() -> None:
+    spec = replace(resized(preset("tiny"), views=4, width=128), detail_px_per_m=5.0, cast_shadows=True)
+    world, shots = plan(spec, 4)
+    assert spec.has_shadows
+    shares = []
+    for number, shot in enumerate(shots[:4]):
+        random = PhotoRandom(4, number, 0.0)
+        cast = trace_photo(world, prepare_photo(spec, world, shot, random))
+        without = trace_photo(world, prepare_photo(replace(spec, cast_shadows=False), world, shot, random))
+        assert cast.shadow is not None and without.shadow is None
+        np.testing.assert_array_equal(cast.clean, without.clean)
+        np.testing.assert_array_equal(cast.owner, without.owner)
+        outside = cast.owner == 0
+        changed = (cast.distracted != cast.clean).any(-1) & outside
+        np.testing.assert_array_equal(changed, cast.shadow & outside)
+        assert (cast.distracted[changed] <= cast.clean[changed]).all()
+        shares.append(changed.mean())
+    assert 0.003 < np.mean(shares) < 0.2

@@ -97,6 +97,7 @@ function start() {
   $("scenes-none").addEventListener("click", () => { state.off = new Set(scenesOf(state.dataset)); draw(); });
   window.addEventListener("hashchange", () => { recall(); draw(); });
   $("filters").addEventListener("submit", (event) => event.preventDefault());
+  $("group-by").addEventListener("change", drawMatrix);
   for (const key of ["plot-x", "plot-y"]) $(key).addEventListener("change", drawPlot);
   for (const key of ["source", "source-metric"]) $(key).addEventListener("change", drawReported);
   startPair();

@@ -7,6 +7,21 @@ function sceneOf(name) {
   return found.find((p) => p.kind === "train") ?? found[0];
 }
 
+/** What is known of a scene of a simulated suite: kind of ambiguity, place, share that distractors cover; or nothing. */
+const factsOf = (name) => DATA.scenes[state.dataset]?.[name] ?? null;
+
+/** The ticked scenes in groups by what is known of them, for means: [name, scenes]. */
+function sceneGroups(scenes) {
+  const by = $("group-by").value;
+  const known = scenes.filter((s) => factsOf(s));
+  return unique(known.map((s) => factsOf(s)[by])).map((value) => [value, known.filter((s) => factsOf(s)[by] === value)]);
+}
+
+function sceneTitle(name) {
+  const f = factsOf(name);
+  return f ? `${f.summary}. Ambiguous in ${f.ambiguity}; distractors cover ${f.covered} % of a photo; ${f.verdict}` : null;
+}
+
 function thumbnail(picture, alt) {
   return picture ? h("img", { class: "thumb", src: `images/${picture.file}`, alt, loading: "lazy" }) : null;
 }
@@ -14,8 +29,10 @@ function thumbnail(picture, alt) {
 function drawMatrix() {
   const scenes = chosenScenes(), key = matrixKey();
   const found = groups(state.dataset).filter((g) => g.runs.some((r) => scenes.includes(r.scene)));
-  const parts = [...(scenes.length > 1 ? [scenes] : []), ...scenes.map((s) => [s])];
-  const names = parts.map((of) => (of.length > 1 ? "mean" : of[0]));
+  const grouped = sceneGroups(scenes);
+  $("group-by-choice").hidden = !grouped.length;
+  const named = [...(scenes.length > 1 ? [["mean", scenes]] : []), ...grouped.filter(([, of]) => of.length > 1 && of.length < scenes.length), ...scenes.map((s) => [s, [s]])];
+  const [names, parts] = [named.map(([name]) => name), named.map(([, of]) => of)];
   const cells = found.map((g) => parts.map((of) => summary(g, key, of)));
   const ranked = parts.map((_, i) => ranks(rankable(found, cells.map((row) => row[i]), key), key));
   const rows = found.map((g, at) => ({ group: g, title: `${g.method} ${g.about}`, cells: cells[at], ranks: ranked.map((r) => r[at]) }));
@@ -25,7 +42,8 @@ function drawMatrix() {
     ...names.map((name, i) => ({
       key: `${i}:${name}`, label: name, arrow: arrow(key), down, sort: (row) => row.cells[i].value,
       picture: parts[i].length === 1 ? thumbnail(sceneOf(parts[i][0]), "") : null,
-      small: parts[i].length > 1 && definedScenes(key, scenes).length < scenes.length ? `${definedScenes(key, scenes).length} of ${scenes.length} scenes` : "",
+      title: parts[i].length === 1 ? sceneTitle(name) : null,
+      small: parts[i].length > 1 ? countedScenes(key, parts[i]) : "",
     })),
   ];
   const fallback = { key: columns[1]?.key ?? "method", down };
@@ -40,6 +58,12 @@ function drawMatrix() {
   $("by-scene").hidden = !rows.length;
   $("matrix-csv").onclick = () => saveCsv(fileName(`${key}-by-scene`), matrixCsv(listed, names, key));
   drawDrill(key);
+}
+
+/** How many of the scenes of a mean have a value, if not all. */
+function countedScenes(key, scenes) {
+  const defined = definedScenes(key, scenes).length;
+  return defined < scenes.length ? `${defined} of ${scenes.length} scenes` : `${scenes.length} scenes`;
 }
 
 function matrixCell(group, of, s, key, rank) {

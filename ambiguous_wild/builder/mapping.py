@@ -88,13 +88,16 @@ def _with_known_cameras(job: MappingJob, database: Path, known: Path) -> Registr
     """Return all photos at their exact poses, with points triangulated from the matches that fit these."""
     matched = Matched.read(database)  # with the exact cameras
     matched.find_relative_poses(job["jobs"])
-    model = triangulate_known(database, known, job["photos"], known, job["seed"])
+    # Points that only two photos observe are kept, as when mapping: twice the points to begin training with.
+    model = triangulate_known(database, known, job["photos"], known, job["seed"], pairs=True)
     placed = Registration(matched, database, model, job["seed"])
     placed.accept_all()
     return placed
 
 
-def triangulate_known(database: Path, known: Path, photos: str, output: Path, seed: int) -> Any:
+def triangulate_known(
+    database: Path, known: Path, photos: str, output: Path, seed: int, *, pairs: bool = False
+) -> Any:
     """Triangulate points from the inliers of known poses; poses and intrinsics do not change.
 
     Args:
@@ -103,6 +106,7 @@ def triangulate_known(database: Path, known: Path, photos: str, output: Path, se
         photos: folder.
         output: folder for COLMAP's files.
         seed: of its random choices.
+        pairs: also triangulate points that only two photos observe.
 
     Returns:
         the model of pycolmap.
@@ -111,8 +115,11 @@ def triangulate_known(database: Path, known: Path, photos: str, output: Path, se
     matched = Matched.read(database)
     matched.take_cameras(posed)
     matched.write_verified(database, matched.verified_pairs(matched.poses(posed)))
+    options = pipeline_options(seed)
+    if pairs:
+        options.triangulation.ignore_two_view_tracks = False
     return pycolmap.triangulate_points(
-        posed, str(database), photos, str(output), options=pipeline_options(seed), refine_intrinsics=False
+        posed, str(database), photos, str(output), options=options, refine_intrinsics=False
     )
 
 

@@ -196,7 +196,9 @@ class Stages:
             "capture": _relative(capture.root, self.target),
             "seconds": {"collect": round(collect_s, 3), **work.seconds()},
         }
-        if capture.truth and own_json(capture.truth / "capture.json").get("evaluation") == {"protocol": "half"}:
+        if capture.truth and own_json(capture.truth / "capture.json").get("evaluation") == {
+            "protocol": "half"
+        }:
             record["evaluation"] = {"protocol": "half"}
         truth_files = [capture.truth / n for n in ("cameras.json", "capture.json")] if capture.truth else []
         parts = SceneParts(

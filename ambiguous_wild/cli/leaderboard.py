@@ -50,7 +50,8 @@ def command() -> None:
 @click.argument("runs", nargs=-1, required=True, type=PathName())
 @_board
 @click.option(
-    "--dataset", help="Dataset of these runs.  [default: as scene.json says; of 'aw simulate': simulated]"
+    "--dataset",
+    help="Dataset of these runs.  [default: as scene.json says; of 'aw simulate' the suite's, else simulated]",
 )
 @click.option(
     "--scene",

@@ -106,8 +106,8 @@ def with_simulated(info: ReleaseInfo, scenes: Mapping[str, Facts]) -> ReleaseInf
         "description": "Ray-cast captures with distractors, clean test photos and exact truth",
         "creators": ("ambiguous-wild",),
         "license": SIMULATED_LICENSE,
-        "consent": "not needed: simulated, no people, no personal data",
-        "contact": "not needed: no photo shows a person",
+        "consent": "not needed: simulated, no recognisable person, no personal data",
+        "contact": "not needed: no photo shows a recognisable person",
     }
     return replace(info, **{key: value for key, value in known.items() if not getattr(info, key)})  # type: ignore[arg-type]
 

@@ -251,12 +251,15 @@ def _differences(
     own: Sequence[MethodScores], board: Sequence[MethodScores], scenes: Sequence[str]
 ) -> Table | None:
     """Return each of our methods against the references; those of the board if it has them."""
-    others = {method.name: method for method in board}
-    others = {name: others[name + BOARD] for name in REFERENCES if name + BOARD in others}
-    others = {method.name: method for method in own if method.name in REFERENCES} | others
-    pairs = [
-        (a, others[name]) for a in own for name in REFERENCES if name in others and others[name] is not a
-    ]
+    boards = {method.name: method for method in board}
+    ours = {method.name: method for method in own}
+    pairs = []
+    for at, name in enumerate(REFERENCES):
+        other = boards.get(name + BOARD, ours.get(name))
+        # of two references of ours one difference is enough
+        without = {name, *REFERENCES[at + 1 :]} if other is ours.get(name) else set()
+        pairs += [(a, other) for a in own if other is not None and a.name not in without]
+    pairs.sort(key=lambda pair: own.index(pair[0]))
     rows = [row for a, b in pairs for key in MEASURED if (row := _pair(a, b, MEASURES[key], scenes))]
     if not rows:
         return None

@@ -36,7 +36,7 @@ def attempts(
     tried: list[str] = []
 
     def attempt(
-        self: Stages, work: Any, screened: Any, photos: Any, masks: Any, plan: Any, before: Any
+        self: Stages, work: Any, screened: Any, photos: Any, masks: Any, plan: Any, before: Any, known: Any
     ) -> SfmStages:
         assert (before.mapping.facts["plan"] if before else None) == (tried[-1] if tried else None)
         tried.append(plan.name)

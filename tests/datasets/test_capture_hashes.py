@@ -24,7 +24,7 @@ from ambiguous_wild.datasets.capture_hashes import (
 )
 from ambiguous_wild.datasets.suites import Simulated, Suite, get_suite, simulated_dataset, simulated_suites
 from ambiguous_wild.simulate.capture_writer import simulate
-from ambiguous_wild.simulate.presets import preset, resized
+from ambiguous_wild.simulate.presets import PRESETS, preset, resized
 
 WIDTH = 64
 TOY = Suite("toy", "toy", {"all": ["tiny"]}, {}, 1, 5, "full", "CC0-1.0", simulated=Simulated(WIDTH, 5))
@@ -163,6 +163,7 @@ def test_suites_of_one_dataset_compare() -> None:
     assert all(set(scenes) <= set(full.tables[kind]) for kind, scenes in mini.tables.items())
     assert large.tables == full.tables and large.dataset != full.dataset
     assert len(full.scenes) == sum(map(len, full.tables.values())) == 19
+    assert set(full.scenes) <= PRESETS.keys()
     assert {suite.license for suite in simulated_suites().values()} == {"CC0-1.0"}
 
 

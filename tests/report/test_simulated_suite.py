@@ -199,7 +199,7 @@ def test_a_package_of_simulated_scenes_needs_no_info(root: Path, tmp_path: Path)
     done = aw("package", root / "scenes-truth" / "toy-a", "-o", tmp_path / "package", "--no-people")
     assert done.returncode == 0 and "NOT FOR RELEASE" not in done.stdout, done.stderr
     card = (tmp_path / "package" / "README.md").read_text()
-    assert "Licence: CC0-1.0" in card and "no people, no personal data" in card
+    assert "Licence: CC0-1.0" in card and "no recognisable person, no personal data" in card
     facts = json.loads((tmp_path / "package" / "croissant.json").read_text())
     assert facts["license"] == "https://spdx.org/licenses/CC0-1.0.html"
     assert aw("verify", tmp_path / "package").stdout.count("warning") == 0

@@ -58,7 +58,12 @@ PACKAGES = ("numpy", "numba", "torch", "opencv-contrib-python-headless", "scipy"
 # Files that record how a scene was made, versions included. Nothing is trained or scored on them: the same
 # photos simulated by a later version are the same scene.
 RECORDS = ("truth/capture.json",)
-MEASURED_WITH = ("truth/clean", "truth/distractor", "truth/shadow", "masks/test")  # folders that scores and references read
+MEASURED_WITH = (
+    "truth/clean",
+    "truth/distractor",
+    "truth/shadow",
+    "masks/test",
+)  # folders that scores and references read
 
 
 def environment(device: str) -> Environment:

@@ -224,7 +224,15 @@ def simulate(
     with atomic_dir(out) as folder:
         shadow = ["truth/shadow"] if spec.has_shadows else []
         optional = [*shadow, *(["truth/depth"] if depth else [])]
-        for part in ("train", "test", "truth/distractor", "truth/instances", "truth/clean", "truth/objects", *optional):
+        for part in (
+            "train",
+            "test",
+            "truth/distractor",
+            "truth/instances",
+            "truth/clean",
+            "truth/objects",
+            *optional,
+        ):
             (folder / part).mkdir(parents=True)
         photos = _render(spec, world, planned, seed, folder, depth, progress)
         write_json(folder / "truth" / "cameras.json", {s.name: _camera_json(spec, s.camera) for s in planned})

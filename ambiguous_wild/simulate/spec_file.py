@@ -232,7 +232,9 @@ def _distractor(where: str, d: Distractor, plan: GroundPlan) -> None:
         _texture(f"{where}head", d.head, TEXTURES)
     _within(where, d, _DISTRACTOR)
     if d.path == "walk" and not d.waypoints:
-        raise AwError(f"{where}waypoints: a walk needs corners, [[x, y], [x, y]] in metres; one to stand there")
+        raise AwError(
+            f"{where}waypoints: a walk needs corners, [[x, y], [x, y]] in metres; one to stand there"
+        )
     if d.bend_deg and d.kind != "visitor":
         raise AwError(f"{where}bend_deg: only a visitor bends, not a {d.kind}")
     if d.path != "walk" and d.waypoints:

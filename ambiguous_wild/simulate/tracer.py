@@ -227,7 +227,10 @@ def first_hits(
         Index of the shape, [H, W] int32, -1 where there is none; its z, [H, W] float64, m.
     """
     shape = (camera.height, camera.width)
-    which, depth_m = np.full(shape, -1, np.int32), np.full(shape, FAR) if behind_m is None else behind_m.copy()
+    which, depth_m = (
+        np.full(shape, -1, np.int32),
+        np.full(shape, FAR) if behind_m is None else behind_m.copy(),
+    )
     _first_hits(
         np.ascontiguousarray(camera.cam_from_world[:3, :3]),
         camera.center,

@@ -43,7 +43,10 @@ from ambiguous_wild.simulate.spec import POSTERS, STATUES, GroundPlan, Thing, Wo
 from ambiguous_wild.simulate.tracer import Atlas, Light, ShapeTable, build_atlas
 
 OVERHEAD_M = 2.0  # foot of a thing that hangs above the distractors
-MIRRORS = {"mirror": 0.85, "glass": 0.0}  # share of the light that is mirrored; of a pane it follows the angle
+MIRRORS = {
+    "mirror": 0.85,
+    "glass": 0.0,
+}  # share of the light that is mirrored; of a pane it follows the angle
 FRAME_M = 0.05  # width of the frame of a mirror or a pane
 SHEETS = {
     "stone": tx.stone, "foliage": tx.foliage, "timber": tx.timber, "clay": tx.clay, "skin": tx.skin,
@@ -315,7 +318,9 @@ def on_wall(
 def poster(name: str, at: tuple[float, float, float], axes: Axes, half_m: float = 0.55) -> Shape:
     """Make a sheet of paper with one of scikit-image's photographs and a border."""
     h, w = tx.photograph(name).shape[:2]
-    return replace(surface(at, (half_m, half_m * h / w), f"poster_{name}", axes, False), thing=f"poster {name}")
+    return replace(
+        surface(at, (half_m, half_m * h / w), f"poster_{name}", axes, False), thing=f"poster {name}"
+    )
 
 
 def _shade_feet(

@@ -130,7 +130,10 @@ def test_who_stands_keeps_its_place_and_a_visitor_turns_and_bends() -> None:
                          path="walk", waypoints=((-1.0, -1.0),))  # fmt: skip
     bust = replace(visitor, name="b", kind="bust", bend_deg=0.0, waypoints=((1.0, -1.0),))
     spec = replace(
-        resized(preset("walkers"), views=9, width=64), distractors=(visitor, bust), detail_px_per_m=6.0, samples=1
+        resized(preset("walkers"), views=9, width=64),
+        distractors=(visitor, bust),
+        detail_px_per_m=6.0,
+        samples=1,
     )
     _, shots = capture_writer.plan(spec, 0)
     placements = [shot.placements for shot in shots[:9]]

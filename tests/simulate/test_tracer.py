@@ -162,7 +162,9 @@ def test_the_kernels_that_are_compiled_ahead_are_those_of_a_capture():
 
 GREY = {name: np.full((2, 2, 3), level, np.float32) for name, level in (("light", 0.8), ("dark", 0.05))}
 FACING = ((1, 0, 0), (0, 0, 1), (0, -1, 0))  # axes of what faces -y
-EVEN = Light(np.tile([0.0, 0.0, 1.0], (4, 1)), np.zeros(3), np.ones(3), np.ones(3))  # the same from everywhere
+EVEN = Light(
+    np.tile([0.0, 0.0, 1.0], (4, 1)), np.zeros(3), np.ones(3), np.ones(3)
+)  # the same from everywhere
 
 
 def _ahead(width: int = 120, height: int = 90) -> Camera:
@@ -186,7 +188,9 @@ def test_a_mirror_shows_what_stands_behind_it_in_a_reflected_world() -> None:
     np.testing.assert_array_equal(mirrored.owner > 0, alone.owner > 0)  # itself and its image
     image = alone.owner == 2
     assert 100 < image.sum() and mirrored.shadow is None
-    inner = image & (np.roll(image, 1, 0) & np.roll(image, -1, 0) & np.roll(image, 1, 1) & np.roll(image, -1, 1))
+    inner = image & (
+        np.roll(image, 1, 0) & np.roll(image, -1, 0) & np.roll(image, 1, 1) & np.roll(image, -1, 1)
+    )
     assert mirrored.distracted[inner] == pytest.approx(0.85 * alone.distracted[inner], rel=1e-5)
     assert mirrored.clean[inner] == pytest.approx(0.85 * alone.clean[inner], rel=1e-5)
     assert mirrored.depth_m[45, 60] == pytest.approx(5.0, abs=0.01) and alone.depth_m[45, 60] > 10
@@ -213,7 +217,9 @@ def test_a_pane_adds_what_it_reflects_and_only_what_changes_is_shadow() -> None:
     np.testing.assert_array_equal(seen.distracted[plain], seen.clean[plain])
     assert 50 < seen.shadow.sum() < 2000  # the image of the light ball
     hidden = (open_air.owner == 1) & inside & ~seen.shadow
-    assert np.median(seen.distracted[hidden][:, 0]) == pytest.approx(dark, abs=2e-3)  # behind: 0.92 + 0.08 of it
+    assert np.median(seen.distracted[hidden][:, 0]) == pytest.approx(
+        dark, abs=2e-3
+    )  # behind: 0.92 + 0.08 of it
     assert open_air.shadow is None
 
 
@@ -221,7 +227,9 @@ def test_who_moves_during_the_exposure_is_there_at_each_instant_for_a_quarter_of
     atlas = build_atlas(GREY)
     back = shape_table([Shape(QUAD, (0, 6.0, 1), (30, 30, 0), "dark", FACING, PLANAR)], atlas)
     x = np.array([-0.3, -0.1, 0.1, 0.3])
-    posts = [Shape(BOX, (at, -2.0, 1.0), (0.3, 0.05, 0.5), "light", owner=1, instant=k) for k, at in enumerate(x)]
+    posts = [
+        Shape(BOX, (at, -2.0, 1.0), (0.3, 0.05, 0.5), "light", owner=1, instant=k) for k, at in enumerate(x)
+    ]
     seen = trace(_ahead(), back, shape_table(posts, atlas), atlas, EVEN)
     row = seen.distracted[45, :, 0]
     centres = (np.arange(120) + 0.5 - 60) / 100 * 2.95  # m at the posts' front

@@ -119,7 +119,7 @@ def colours() -> list[str]:
 
 
 def ranking(found: Board, groups: Sequence[Sequence[str]]) -> list[tuple[str, list[str]]]:
-    """Name and mean PSNR by group of the methods that are measured on all scenes, the best in the mean first."""
+    """Name and mean PSNR by group of the methods that are measured on all scenes, the best first."""
     scenes = [scene for group in groups for scene in group]
     psnr = {
         name: [mean(found[scene][name]["psnr"] for scene in group) for group in groups]

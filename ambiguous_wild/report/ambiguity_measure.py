@@ -182,8 +182,8 @@ def measure(
         masks: masks of its distractors.
         background: the background behind them.
         features: name of a back end, see `vision.backends`.
-        objects: folder with masks of static objects to compare with, white = object; None: those of a simulated
-            capture, else all segments.
+        objects: folder with masks of static objects to compare with, white = object; None: those of a
+            simulated capture, else all segments.
         progress: wraps the list of views, to show a bar.
 
     Raises:
@@ -249,7 +249,7 @@ def measure(
 
 
 def _instances(scene: Scene, masks: DistractorMasks, view: View, hidden: np.ndarray) -> np.ndarray:
-    """Label the distractors of a mask [h, w] bool: by the numbers of a simulated capture, else connected regions."""
+    """Label the distractors of a mask [h, w] bool: by numbers of a simulated capture, else by connection."""
     from scipy import ndimage
 
     path = scene.root / "truth" / "instances" / f"{stem(view)}.png"

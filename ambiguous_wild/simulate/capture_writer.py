@@ -4,12 +4,12 @@ RAW/train/IMG_0001.jpg ...        with distractors
 RAW/test/IMG_0101.jpg ...         other viewpoints, no distractors
 RAW/truth/cameras.json            name -> size, fx, fy, cx, cy, cam_from_world (OpenCV axes, metres)
 RAW/truth/distractor/<stem>.png   255 where any part of the pixel shows a distractor, else 0
-RAW/truth/instances/<stem>.png    0, or the number of the distractor in the spec, from 1; 255: fixed to the camera
+RAW/truth/instances/<stem>.png    number of the distractor in the spec, from 1; 255: fixed to the camera
 RAW/truth/clean/<stem>.png        the train photo without distractors, same effects, before JPEG
 RAW/truth/shadow/<stem>.png       with moving shadows or panes of glass: 255 where a shadow, or what a pane
                                   reflects, changes the static scene
-RAW/truth/objects/<stem>.png      0, or the number of the static object (statue, car, poster) in the middle of the
-                                  pixel, as if no distractor were there
+RAW/truth/objects/<stem>.png      number of the static object (statue, car, poster) in the pixel's middle,
+                                  as if no distractor were there
 RAW/truth/depth/<stem>.png        optional: z of the static surface, 16 bit, millimetres
 RAW/truth/capture.json            spec, seed, versions, label; per photo occlusion, placed distractors and
                                   drawn effects; sha256 of every file
@@ -392,8 +392,8 @@ def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, PhotoT
         "version": {"ambiguous_wild": __version__, "scikit-image": version("scikit-image")},
         "spec": plain_spec(spec),
         "designed": to_plain(spec.designed),
-        "mask": "255 where any part of a pixel shows a distractor, also in a mirror; their shadows on the scene, "
-        "if they cast any, and reflections in glass are in truth/shadow",
+        "mask": "255 where any part of a pixel shows a distractor, also in a mirror; their shadows, if "
+        "they cast any, and reflections in glass are in truth/shadow",
         "clean": "same camera, same effects, no distractors and no moving shadow, before JPEG",
         "test": "no distractors; of the effects only specular and lens_distortion",
         "occlusion": summary(shares),

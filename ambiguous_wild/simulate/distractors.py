@@ -1,7 +1,7 @@
 """Distractors: shapes that are placed in the world anew for every photo.
 
-Perspective, occlusion and shadows on distractors are exact. Unless the spec says `cast_shadows`, they cast none
-on the static world, so that outside their pixels the photo with distractors equals the clean photo.
+Perspective, occlusion and shadows on distractors are exact. Unless the spec says `cast_shadows`, they cast
+none on the static world, so that outside their pixels the photo with distractors equals the clean photo.
 """
 
 from __future__ import annotations
@@ -41,26 +41,22 @@ class DistractorPose:
 
 
 def shapes_of(distractor: Distractor, placement: DistractorPose, plan: GroundPlan) -> list[Shape]:
-    """Make the distractor's shapes in the world, owned by ``placement.which + 1``; a blurred one at each instant."""
-    at = np.array([placement.x_m, placement.y_m, distractor.lift_m * placement.pose])
+    """Make the distractor's shapes in the world, owned by ``placement.which + 1``.
+
+    One that moves during the exposure is there at each instant, at another place.
+    """
+    at = (placement.x_m, placement.y_m, distractor.lift_m * placement.pose)
     parts = [_tinted(s, distractor) for s in _parts(distractor, placement.pose, plan)]
     owner = placement.which + 1
     if not distractor.blur_m:
         return placed(parts, at, placement.yaw_deg, distractor.size, owner=owner)
     facing = np.deg2rad(placement.yaw_deg) - np.pi / 2  # figures face -y
-    way = distractor.blur_m * np.array([np.cos(facing), np.sin(facing), 0.0])
-    return [
-        shape
-        for k in range(INSTANTS)
-        for shape in placed(
-            parts,
-            at + ((k + 0.5) / INSTANTS - 0.5) * way,
-            placement.yaw_deg,
-            distractor.size,
-            owner=owner,
-            instant=k,
-        )
-    ]
+    shapes = []
+    for instant in range(INSTANTS):
+        way = distractor.blur_m * ((instant + 0.5) / INSTANTS - 0.5)
+        there = (at[0] + way * float(np.cos(facing)), at[1] + way * float(np.sin(facing)), at[2])
+        shapes += placed(parts, there, placement.yaw_deg, distractor.size, owner=owner, instant=instant)
+    return shapes
 
 
 def _parts(distractor: Distractor, pose: float, plan: GroundPlan) -> list[Shape]:
@@ -93,7 +89,7 @@ def _parts(distractor: Distractor, pose: float, plan: GroundPlan) -> list[Shape]
 
 
 def _tinted(shape: Shape, distractor: Distractor) -> Shape:
-    """Tint the parts with the distractor's texture, but not a head with another texture, nor glass of a car."""
+    """Tint the parts with the distractor's texture, not a head with another texture, nor glass of a car."""
     if shape.texture != distractor.texture or distractor.kind == "car" or distractor.tint == (1.0, 1.0, 1.0):
         return shape
     r, g, b = (x * y for x, y in zip(shape.tint, distractor.tint))

@@ -1,8 +1,8 @@
 """Inner kernels of the ray caster: intersection, texture lookup and shading.
 
-Arguments: a table is `ShapeTable.columns()` and the arrays of its `ShadowGrid`, an atlas `(texels, offset, width,
-height, levels)`, a light `(sun directions, sun colour, sky colour, ground colour)`, a sample `(index of its sun
-direction, instant)`; points and directions are tuples of three.
+Arguments: a table is `ShapeTable.columns()` and its `tracer.shadow_grid`, an atlas `(texels, offset, width,
+height, levels)`, a light `(sun directions, sun colour, sky colour, ground colour)`, a sample `(index of its
+sun direction, instant)`; points and directions are tuples of three.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ def nearest(table, which, count, o, d, far, instant):
 
 @kernel(inline="never")
 def _shadowed(table, o, d, sample):
-    """Return whether a shape lies between the point and the sun: one of those in the point's cell of the grid."""
+    """Return whether a shape of the point's cell of the grid lies between the point and the sun."""
     center, radius, instants = table[2], table[4], table[11]
     frame, start, members = table[15], table[16], table[17]
     n, instant = sample
@@ -388,8 +388,8 @@ def reflect(mirrors, g, t, o, d, spread, atlas, light, sample, static, movers, s
         every: the numbers of all static shapes and of all movers.
 
     Returns:
-        The share of the light that is reflected, the reflection with and without distractors, the owner of the
-        distractor in it, or 0.
+        The share of the light that is reflected, the reflection with and without distractors, the owner of
+        the distractor in it, or 0.
     """
     axes, tint = mirrors[1], mirrors[8]
     nx, ny, nz = axes[g, 2, 0], axes[g, 2, 1], axes[g, 2, 2]

@@ -232,7 +232,7 @@ def vector(values: Iterable[float]) -> Vector:
 def placed(
     shapes: Iterable[Shape], at: Sequence[float], yaw_deg: float, size: float = 1.0, **more: Any
 ) -> list[Shape]:
-    """Turn shapes about z, scale them and move them to `at`, with their textures; `more`: other fields to set."""
+    """Turn shapes about z, scale them and move them to `at`, with their textures; `more`: fields to set."""
     c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
     left, ahead, up = vector(at)
 

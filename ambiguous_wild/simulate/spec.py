@@ -116,7 +116,7 @@ class Distractor:
     # elsewhere: a new place in every photo; walk: along `waypoints`; ahead: in front of the camera, which
     # follows it
     path: Literal["elsewhere", "walk", "ahead"] = "elsewhere"
-    # m: x and y of the corners of its walk; at a single one it stands, and a visitor turns from photo to photo
+    # m: x and y of the corners of its walk; at a single one it stands, and a visitor turns every time
     waypoints: tuple[tuple[float, float], ...] = ()
     laps: float = 1.0  # times it walks there and back during the capture
 
@@ -128,8 +128,8 @@ class Thing:
     kind: ThingKind
     texture: str
     at_m: tuple[float, float, float]  # middle of its foot: x to the right, y away from the walk, z up
-    # Width, depth, height; of a statue only the height is used, of a car only the width, as its length. A mirror
-    # and a pane of glass have a frame of the texture.
+    # Width, depth, height; of a statue only the height is used, of a car only the width, as its length. A
+    # mirror and a pane of glass have a frame of the texture.
     size_m: tuple[float, float, float] = (1.0, 1.0, 1.0)
     yaw_deg: float = 0.0
     tint: Colour = (1.0, 1.0, 1.0)

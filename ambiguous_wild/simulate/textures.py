@@ -1,8 +1,8 @@
 """Textures made of photographs in scikit-image, without repetition.
 
 In a tiled photograph COLMAP would match a brick with its copy; blended layers and noise make every square
-metre different. All is computed in float64 and stored as float32: float32 powers and blurs differ in their last
-bit between processors, which would change pixels.
+metre different. All is computed in float64 and stored as float32: float32 powers and blurs differ in their
+last bit between processors, which would change pixels.
 """
 
 from __future__ import annotations

@@ -107,8 +107,8 @@ def shadow_grid(table: ShapeTable, sun: np.ndarray) -> tuple[np.ndarray, np.ndar
         sun: [K, 3] directions, each with a grid of its own across it.
 
     Returns:
-        frame [K, 9] float64, the grid's two axes, its corner in m, and cells per m; start [K, cells + 1] int32 and
-        members [M] int32: cell c of direction k holds the shapes ``members[start[k, c]:start[k, c + 1]]``.
+        frame [K, 9] float64, two axes of the grid, its corner, m, and cells per m; start [K, cells + 1] int32
+        and members [M] int32: cell c of direction k holds ``members[start[k, c]:start[k, c + 1]]``.
     """
     which = np.flatnonzero(table.casts).astype(np.int32)
     frame = np.zeros((len(sun), 9))

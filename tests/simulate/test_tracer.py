@@ -173,7 +173,7 @@ def _ahead(width: int = 120, height: int = 90) -> Camera:
 
 
 def test_a_mirror_shows_what_stands_behind_it_in_a_reflected_world() -> None:
-    """A ball in front of the mirror in y = 0 is seen in it as one at the reflected place is without a mirror."""
+    """In the mirror in y = 0 a ball is seen as one at the reflected place is without it."""
     atlas = build_atlas(GREY)
     back = Shape(QUAD, (0, 6.0, 1), (30, 30, 0), "dark", FACING, PLANAR)
     front = replace(back, center=(0, -6.0, 1), axes=((1, 0, 0), (0, 0, -1), (0, 1, 0)))
@@ -187,7 +187,7 @@ def test_a_mirror_shows_what_stands_behind_it_in_a_reflected_world() -> None:
     alone = trace(_ahead(), shape_table([back], atlas), shape_table([reflected, ball], atlas), atlas, EVEN)
     np.testing.assert_array_equal(mirrored.owner > 0, alone.owner > 0)  # itself and its image
     image = alone.owner == 2
-    assert 100 < image.sum() and mirrored.shadow is None
+    assert image.sum() > 100 and mirrored.shadow is None
     inner = image & (
         np.roll(image, 1, 0) & np.roll(image, -1, 0) & np.roll(image, 1, 1) & np.roll(image, -1, 1)
     )

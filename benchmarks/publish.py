@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from job_queue import Run, aw, count, exit_code, run_all, seed
@@ -22,20 +22,21 @@ from job_queue import Run, aw, count, exit_code, run_all, seed
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.suites import get_suite
 from ambiguous_wild.methods.registry import all_methods
+from ambiguous_wild.report.simulated_suite import prepare_simulated
 
 ROOT = Path(__file__).parents[1]
+SUITE = get_suite("aw-sim")
 BASES = {"seneca": 4, "monstree": 4, "sceaux": 4, "tiny_aerial": 2}  # downsampling to 240 px and more
 KINDS = ("cutouts", "patches")
 METHODS = ("3dgs", "dronesplat", "robustsplat", "refinesplat", "3dgs+truth")
-WORLD = 5  # seed of worlds and of pasted distractors; nothing was tuned on it
+WORLD = 5  # seed of pasted distractors; nothing was tuned on it
 
 
 @dataclass(frozen=True)
 class Capture:
-    """How the photos of a scene are made."""
+    """How the photos of a composite are made."""
 
     name: str
-    dataset: str
     factor: int
     words: tuple[str, ...]  # of `aw`, all but the output
 
@@ -50,17 +51,19 @@ class Capture:
         return scene
 
 
-def captures(data: Path | None) -> Iterator[Capture]:
-    """All captures; those of real photos only with a folder of photos."""
-    suite = get_suite("aw-sim")
-    for name in suite.scenes:
-        words = ("simulate", name, "--width", str(suite.width), "--seed", str(WORLD))
-        yield Capture(name, suite.dataset, suite.factor, words)
+def composites(data: Path | None) -> Iterator[Capture]:
+    """All composites; there are none without a folder of photos."""
     for base, factor in BASES.items() if data is not None else ():
         for kind in KINDS:
             words = ("composite", str(data / base), "--seed", str(WORLD))
             words += ("--cutouts", str(data / "cutouts")) if kind == "cutouts" else ("--patches",)
-            yield Capture(f"{base}-{kind}", "composites", factor, words)
+            yield Capture(f"{base}-{kind}", factor, words)
+
+
+def suite_scenes(names: Sequence[str], work: Path) -> dict[str, Path]:
+    """The scene folders of some captures of the suite; they are made if they are not there."""
+    some = replace(SUITE, tables={"chosen": list(names)})
+    return prepare_simulated(some, work / SUITE.dataset, say=print).scenes if names else {}
 
 
 def runs_of(scene: Path, args: argparse.Namespace) -> Iterator[Run]:
@@ -90,19 +93,21 @@ def main(words: Sequence[str] | None = None) -> int:
     if args.methods == ["all"]:
         args.methods = [*all_methods()]
     args.runs = args.work / "-".join(["runs", *args.set])  # runs with other options have their own folder
-    known = {capture.name: capture for capture in captures(args.data)}
-    if unknown := set(args.only or ()) - known.keys():
+    pasted = {capture.name: capture for capture in composites(args.data)}
+    known = [*SUITE.scenes, *pasted]
+    if unknown := set(args.only or ()) - {*known}:
         raise AwError(f"--only {min(unknown)}: no such capture; there are {', '.join(known)}")
-    chosen = [known[name] for name in args.only or known]
+    chosen = args.only or known
     if idle := {option.partition(".")[0] for option in args.set} - {*args.methods}:
         raise AwError(f"--set {min(idle)}: --methods does not have it")
-    scenes = {capture: capture.build(args.work) for capture in chosen}
+    scenes = suite_scenes([name for name in chosen if name in SUITE.scenes], args.work)
+    scenes |= {name: pasted[name].build(args.work) for name in chosen if name in pasted}
     failed = run_all([run for scene in scenes.values() for run in runs_of(scene, args)], args.jobs)
-    for capture in scenes:
+    for name in scenes:
         # the photos of the bases may not be passed on
-        images = "0" if capture.dataset == "composites" else "1"
-        add = ("leaderboard", "add", str(args.runs / capture.name), "--board", str(args.board))
-        print(aw(*add, "--dataset", capture.dataset, "--images", images, "--overwrite"), end="", flush=True)
+        dataset, images = ("composites", "0") if name in pasted else (SUITE.dataset, "1")
+        add = ("leaderboard", "add", str(args.runs / name), "--board", str(args.board))
+        print(aw(*add, "--dataset", dataset, "--images", images, "--overwrite"), end="", flush=True)
     for line in failed:
         print(f"failed: {line}", file=sys.stderr)
     return 1 if failed else 0

@@ -18,7 +18,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import mean
 
-from ambiguous_wild.datasets.suites import get_suite
+from ambiguous_wild.datasets.suites import get_suite, measured_ambiguity
+from ambiguous_wild.simulate.presets import preset
 
 ROOT = Path(__file__).parents[1]
 RANKED = ("3dgs", "dronesplat", "robustsplat", "refinesplat")
@@ -101,6 +102,20 @@ def scenes() -> list[str]:
     return lines
 
 
+def suite() -> list[str]:
+    """What the suite's captures show, and how ambiguous they are."""
+    measured, lines = measured_ambiguity(), []
+    for kind, scenes in SUITE.items():
+        for name in scenes:
+            spec, facts = preset(name), measured[name]
+            shares = [
+                f"{100 * facts[key]:.0f} %" if key in facts else ""
+                for key in ("occlusion", "colour", "lookalike")
+            ]
+            lines.append(line([name, spec.world.place, kind, *shares, str(spec.train_views), spec.summary]))
+    return lines
+
+
 def baselines() -> list[str]:
     """Mean PSNR of every method by kind of capture, and the seconds of its training, if it ran alone."""
     seconds = {
@@ -132,6 +147,7 @@ def ranking(found: Board, groups: Sequence[Sequence[str]]) -> list[tuple[str, li
 
 TABLES: dict[str, dict[str, Callable[[], list[str]]]] = {
     "README.md": {"means": means},
+    "docs/datasets.md": {"suite": suite},
     "docs/refinesplat.md": {"scenes": scenes},
     "docs/baselines.md": {"baselines": baselines, "colours": colours},
 }

@@ -12,16 +12,22 @@ Checked runs go to the board, leaderboard/measured; then `python benchmarks/figu
 from __future__ import annotations
 
 import argparse
+import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from job_queue import Run, aw, count, exit_code, run_all, seed
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.datasets.suites import MEASURED as FACTS
 from ambiguous_wild.datasets.suites import get_suite
+from ambiguous_wild.io.files import write_text
+from ambiguous_wild.io.plain_yaml import read_mapping
 from ambiguous_wild.methods.registry import all_methods
+from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
+from ambiguous_wild.report.ambiguity_summary import semantic_metric
 from ambiguous_wild.report.simulated_suite import prepare_simulated
 
 ROOT = Path(__file__).parents[1]
@@ -66,6 +72,29 @@ def suite_scenes(names: Sequence[str], work: Path) -> dict[str, Path]:
     return prepare_simulated(some, work / SUITE.dataset, say=print).scenes if names else {}
 
 
+def record_ambiguity(scenes: Mapping[str, Path], work: Path) -> None:
+    """Write what `aw ambiguity-report` measures of the suite's scenes beside the suite."""
+    known = read_mapping(FACTS) if FACTS.is_file() else {}
+    for name, scene in scenes.items():
+        report = work / "ambiguity" / name
+        if not (report / "ambiguity.json").is_file():
+            aw("ambiguity-report", str(scene), "-o", str(report), "--no-record")
+        measured = json.loads((report / "ambiguity.json").read_text(encoding="utf-8"))
+        colour, look = (measured[key]["value"] for key in (COLOUR_METRIC, semantic_metric("labhog")))
+        known[name] = {
+            "occlusion": round(measured["occlusion"]["value"], 3),
+            **({} if colour is None else {"colour": round(colour, 3), "lookalike": round(look, 3)}),
+            "class": measured["class"],
+        }
+    head = (
+        "# What 'aw ambiguity-report' measures of the captures of aw-sim; written by benchmarks/publish.py.\n"
+    )
+    lines = [
+        f"{name}: {json.dumps(known[name]).replace(chr(34), '')}" for name in SUITE.scenes if name in known
+    ]
+    write_text(FACTS, head + "\n".join(lines) + "\n")
+
+
 def runs_of(scene: Path, args: argparse.Namespace) -> Iterator[Run]:
     """A run for each method and seed."""
     options = [option.partition(".")[::2] for option in args.set]
@@ -101,6 +130,7 @@ def main(words: Sequence[str] | None = None) -> int:
     if idle := {option.partition(".")[0] for option in args.set} - {*args.methods}:
         raise AwError(f"--set {min(idle)}: --methods does not have it")
     scenes = suite_scenes([name for name in chosen if name in SUITE.scenes], args.work)
+    record_ambiguity(scenes, args.work)
     scenes |= {name: pasted[name].build(args.work) for name in chosen if name in pasted}
     failed = run_all([run for scene in scenes.values() for run in runs_of(scene, args)], args.jobs)
     for name in scenes:

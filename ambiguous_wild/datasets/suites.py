@@ -13,6 +13,9 @@ from ambiguous_wild.datasets.foreign import plain
 from ambiguous_wild.io.plain_yaml import read_mapping
 
 FILE = Path(__file__).with_name("suites.yaml")
+MEASURED = Path(__file__).with_name(
+    "aw_sim.yaml"
+)  # ambiguity of the simulated captures, by `aw ambiguity-report`
 SLACK = 0.1  # undistorting crops a photo by less than this
 
 
@@ -69,6 +72,12 @@ def _suite(row: Mapping[str, Any]) -> Suite:
 def simulated_suites() -> dict[str, Suite]:
     """Return the suites whose captures are simulated, by name."""
     return {name: suite for name, suite in suites().items() if suite.simulated is not None}
+
+
+@cache
+def measured_ambiguity() -> dict[str, dict[str, Any]]:
+    """Read what is measured of the captures of aw-sim: occlusion, colour, lookalike (shares), class; by scene."""
+    return read_mapping(MEASURED)
 
 
 def get_suite(name: str) -> Suite:

@@ -53,6 +53,7 @@ from ambiguous_wild.report.board import (
     slug,
     to_number,
 )
+from ambiguous_wild.report.suite import scene_facts
 from ambiguous_wild.viewing.page_file import page_text
 
 COSTS = ("reference_s", "train_s", "model_mb", "fps", "gaussians", "peak_rss_mb")
@@ -136,6 +137,7 @@ def facts(
         # name -> summary, paper, links
         "methods": {shown.get(name, name): _method(name) for name in sorted({e.method for e in entries})},
         "measures": measures,
+        "scenes": scene_facts({e.dataset for e in entries}),
         "runs": [_run(e) | {"method": shown.get(e.method, e.method)} for e in entries],
         "models": dict(models),
         "images": [

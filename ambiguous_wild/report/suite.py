@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.datasets.foreign import plain
-from ambiguous_wild.datasets.suites import Suite, find_scenes, scene_id
+from ambiguous_wild.datasets.suites import (
+    Suite,
+    find_scenes,
+    measured_ambiguity,
+    scene_id,
+    simulated_suites,
+)
 
 if TYPE_CHECKING:
     from ambiguous_wild.report.table_layout import Table
 
 SCENES = ".scenes"  # below the runs: imported scenes
+OCCLUSIONS = (0.15, 0.3)  # shares of a photo between which scenes are grouped
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,35 @@ def _ready(suite: Suite, name: str, folder: Path, target: Path, say: Callable[[s
         for warning in done.info["warnings"]:
             say(f"warning: {name}: {warning}")
     return target
+
+
+def scene_facts(datasets: Collection[str]) -> dict[str, dict[str, Facts]]:
+    """Return what is known of the scenes of simulated suites, for a page: dataset -> scene -> facts."""
+    from ambiguous_wild.simulate.presets import preset
+
+    measured = measured_ambiguity()
+    found: dict[str, dict[str, Facts]] = {}
+    for suite in simulated_suites().values():
+        for kind, scenes in suite.tables.items() if suite.dataset in datasets else ():
+            for scene in scenes:
+                spec, ambiguity = preset(scene), measured.get(scene, {})
+                covered = ambiguity.get("occlusion")
+                found.setdefault(suite.dataset, {})[scene] = {
+                    "ambiguity": kind,
+                    "place": spec.world.place,
+                    "occlusion": _occlusion_class(covered),
+                    "covered": None if covered is None else round(100 * covered),
+                    "summary": spec.summary,
+                    "verdict": ambiguity.get("class", "not measured"),
+                }
+    return found
+
+
+def _occlusion_class(share: float | None) -> str:
+    if share is None:
+        return "not measured"
+    limit = next((limit for limit in OCCLUSIONS if share < limit), None)
+    return f"{OCCLUSIONS[-1]:.0%} and more" if limit is None else f"below {limit:.0%}"
 
 
 def suite_methods(suite: Suite) -> list[str]:

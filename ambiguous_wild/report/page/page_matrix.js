@@ -19,7 +19,7 @@ function sceneGroups(scenes) {
 
 function sceneTitle(name) {
   const f = factsOf(name);
-  return f ? `${f.summary}. Ambiguous in ${f.ambiguity}; distractors cover ${f.covered} % of a photo; ${f.verdict}` : null;
+  return f ? `${f.summary} (${f.place}); distractors cover ${f.covered ?? "?"} % of the photos; ambiguity by design: ${f.ambiguity}, measured: ${f.verdict}` : null;
 }
 
 function thumbnail(picture, alt) {

@@ -13,9 +13,7 @@ from ambiguous_wild.datasets.foreign import plain
 from ambiguous_wild.io.plain_yaml import read_mapping
 
 FILE = Path(__file__).with_name("suites.yaml")
-MEASURED = Path(__file__).with_name(
-    "aw_sim.yaml"
-)  # ambiguity of the simulated captures, by `aw ambiguity-report`
+MEASURED = Path(__file__).with_name("aw_sim.yaml")  # ambiguity of the captures of aw-sim
 SLACK = 0.1  # undistorting crops a photo by less than this
 
 
@@ -76,7 +74,7 @@ def simulated_suites() -> dict[str, Suite]:
 
 @cache
 def measured_ambiguity() -> dict[str, dict[str, Any]]:
-    """Read what is measured of the captures of aw-sim: occlusion, colour, lookalike (shares), class; by scene."""
+    """Read what is measured of aw-sim: scene -> shares occlusion, colour and lookalike, and class."""
     return read_mapping(MEASURED)
 
 

@@ -75,7 +75,7 @@ def simulated(folder: Path, text: str) -> Result:
         ),
         (f"distractors: [{RED.replace('cloth', 'clohT')}]", "did you mean 'cloth'"),
         (f"distractors: [{RED[:-1]}, size: -1}}]", "distractors[0].size: between 0.02 and 10, got -1"),
-        (f"distractors: [{RED[:-1]}, path: walk}}]", "a walk needs two corners"),
+        (f"distractors: [{RED[:-1]}, path: walk}}]", "a walk needs corners"),
         (f"distractors: [{RED[:-1]}, laps: 3}}]", "laps: only read with 'path: walk'"),
         (f"distractors: [{RED[:-1]}, path: ahead, laps: 3}}]", "laps: only read with 'path: walk'"),
         (f"distractors: [{RED[:-1]}, path: wlak}}]", "did you mean 'walk'"),

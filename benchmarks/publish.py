@@ -86,13 +86,10 @@ def record_ambiguity(scenes: Mapping[str, Path], work: Path) -> None:
             **({} if colour is None else {"colour": round(colour, 3), "lookalike": round(look, 3)}),
             "class": measured["class"],
         }
-    head = (
-        "# What 'aw ambiguity-report' measures of the captures of aw-sim; written by benchmarks/publish.py.\n"
-    )
-    lines = [
-        f"{name}: {json.dumps(known[name]).replace(chr(34), '')}" for name in SUITE.scenes if name in known
-    ]
-    write_text(FACTS, head + "\n".join(lines) + "\n")
+    lines = ["# What 'aw ambiguity-report' measures of aw-sim; written by benchmarks/publish.py."]
+    for name in SUITE.scenes:
+        lines.append(f"{name}: {json.dumps(known.get(name, {})).replace(chr(34), '')}")
+    write_text(FACTS, "\n".join(lines) + "\n")
 
 
 def runs_of(scene: Path, args: argparse.Namespace) -> Iterator[Run]:

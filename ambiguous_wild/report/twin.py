@@ -141,7 +141,6 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0, views: int 
     """
     seen = of.evidence
     outward = seen.outward > OUTWARD
-    place = "yard" if outward else "courtyard"
     factor = min(of.factor, LONGEST // max(of.size)) if width is None else round(width / of.size[0])
     factor = max(factor, 1)
     wide = of.size[0] * factor if width is None else width
@@ -149,7 +148,8 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0, views: int 
     focal_mm = float(np.clip(of.focal * FULL_FRAME_DIAGONAL_MM, 12, 150))
     arc_deg = float(np.clip(of.arc_deg, 20, 360 if outward else 125))
     zoom = _zoom(_clear(seen.sampling, SAMPLING))
-    base = preset(f"{place}-plain")
+    plain = preset("courtyard-plain")
+    base = replace(preset("yard"), distractors=plain.distractors) if outward else plain
     in_focal = float(np.hypot(wide, high)) * focal_mm / FULL_FRAME_DIAGONAL_MM
     least, mean, most = of.moving
     least, most = np.clip((least, most), *OCCLUDED).tolist() if mean >= MOVES else (0.0, 0.0)

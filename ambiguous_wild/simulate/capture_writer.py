@@ -259,7 +259,7 @@ def _render(
         number: int, prepared: PreparedPhoto, traced: TracedPhoto, metres: np.ndarray | None
     ) -> None:
         photo = planned[number]
-        rendered = finish_photo(world, photo, randoms[number], prepared, traced)
+        rendered = finish_photo(photo, randoms[number], prepared, traced)
         _write_photo(
             folder / photo.split / photo.name, rendered.photo, spec, photo.camera, number, rendered.effects
         )

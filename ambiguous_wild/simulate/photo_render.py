@@ -77,6 +77,7 @@ class PreparedPhoto:
     distractors: ShapeTable
     fixed: FixedThing | None  # fixed to the camera
     move: ImageFilter | None  # effects that move pixels
+    things: np.ndarray  # [S] uint8: number of the object that each static shape belongs to, 0 = none
     drawn: DrawnEffects  # random values of the effects so far
 
 
@@ -91,7 +92,10 @@ def prepare_photo(
     move, camera, light = _optics(effects, planned.camera, scene.light, random, drawn)
     distractors = shape_table(shapes, world.atlas)
     fixed = spec.fixed if planned.split == "train" else None
-    return PreparedPhoto(effects, replace(scene, light=light), camera, distractors, fixed, move, drawn)
+    names = sorted({"", *(s.thing for s in world.shapes)})
+    things = np.array([names.index(s.thing) for s in world.shapes], np.uint8)
+    lit = replace(scene, light=light)
+    return PreparedPhoto(effects, lit, camera, distractors, fixed, move, things, drawn)
 
 
 def trace_photo(world: World, prepared: PreparedPhoto) -> TracedPhoto:
@@ -109,7 +113,7 @@ def trace_photo(world: World, prepared: PreparedPhoto) -> TracedPhoto:
 
 
 def finish_photo(
-    world: World, planned: PlannedPhoto, random: PhotoRandom, prepared: PreparedPhoto, traced: TracedPhoto
+    planned: PlannedPhoto, random: PhotoRandom, prepared: PreparedPhoto, traced: TracedPhoto
 ) -> RenderedPhoto:
     """Do the steps after the rays are traced."""
     effects, drawn = prepared.effects, prepared.drawn
@@ -124,15 +128,13 @@ def finish_photo(
         quality = fx.draw_jpeg(effects.jpeg, random)
         pixels = fx.jpeg(pixels, quality)
         drawn["jpeg"] = {"quality": quality}
-    return RenderedPhoto(pixels, clean_pixels, owner, shadow, _things(world, prepared, planned.camera), drawn)
+    return RenderedPhoto(pixels, clean_pixels, owner, shadow, _things(prepared, planned.camera), drawn)
 
 
-def _things(world: World, prepared: PreparedPhoto, camera: Camera) -> np.ndarray:
+def _things(prepared: PreparedPhoto, camera: Camera) -> np.ndarray:
     """Return the number of the static object in each pixel, [H, W] uint8, as if no distractor were there."""
     which, _ = first_hits(prepared.camera, prepared.scene.static)
-    names = sorted({s.thing for s in world.shapes})
-    numbers = np.array([names.index(s.thing) if s.thing else 0 for s in world.shapes], np.uint8)
-    labels = np.where(which >= 0, numbers[which], 0).astype(np.uint8)
+    labels = np.where(which >= 0, prepared.things[which], 0).astype(np.uint8)
     if prepared.move is None:
         return labels
     moved = np.zeros((camera.height, camera.width), np.uint8)

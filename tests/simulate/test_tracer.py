@@ -228,16 +228,16 @@ def test_who_moves_during_the_exposure_is_there_at_each_instant_for_a_quarter_of
     back = shape_table([Shape(QUAD, (0, 6.0, 1), (30, 30, 0), "dark", FACING, PLANAR)], atlas)
     x = np.array([-0.3, -0.1, 0.1, 0.3])
     posts = [
-        Shape(BOX, (at, -2.0, 1.0), (0.3, 0.05, 0.5), "light", owner=1, instant=k) for k, at in enumerate(x)
+        Shape(BOX, (at, -2.0, 1.0), (0.36, 0.05, 0.5), "light", owner=1, instant=k) for k, at in enumerate(x)
     ]
     seen = trace(_ahead(), back, shape_table(posts, atlas), atlas, EVEN)
     row = seen.distracted[45, :, 0]
     centres = (np.arange(120) + 0.5 - 60) / 100 * 2.95  # m at the posts' front
-    count = (np.abs(centres[:, None] - x) < 0.3).sum(1)
-    edge = (np.abs(np.abs(centres[:, None] - x) - 0.3) < 0.04).any(1)
+    count = (np.abs(centres[:, None] - x) < 0.36).sum(1)
+    edge = (np.abs(np.abs(centres[:, None] - x) - 0.36) < 0.04).any(1)
     assert row[~edge] == pytest.approx((0.05 + (0.8 - 0.05) * count / 4)[~edge], abs=1e-4)
     np.testing.assert_array_equal(seen.owner[45][~edge] > 0, count[~edge] > 0)
-    assert set(count[~edge]) == {0, 1, 2, 3, 4} or set(count[~edge]) >= {0, 2, 4}
+    assert set(count[~edge]) >= {0, 4}
 
 
 def test_shadows_of_distractors_darken_what_the_truth_says_and_nothing_else() -> None:

@@ -86,10 +86,9 @@ def record_ambiguity(scenes: Mapping[str, Path], work: Path) -> None:
             **({} if colour is None else {"colour": round(colour, 3), "lookalike": round(look, 3)}),
             "class": measured["class"],
         }
-    lines = ["# What 'aw ambiguity-report' measures of aw-sim; written by benchmarks/publish.py."]
-    for name in SUITE.scenes:
-        lines.append(f"{name}: {json.dumps(known.get(name, {})).replace(chr(34), '')}")
-    write_text(FACTS, "\n".join(lines) + "\n")
+    head = "# What 'aw ambiguity-report' measures of aw-sim; written by benchmarks/publish.py."
+    lines = [f"{name}: {json.dumps(known.get(name, {})).replace(chr(34), '')}" for name in SUITE.scenes]
+    write_text(FACTS, "\n".join([head, *lines]) + "\n")
 
 
 def runs_of(scene: Path, args: argparse.Namespace) -> Iterator[Run]:

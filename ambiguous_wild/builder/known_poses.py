@@ -93,6 +93,11 @@ def _lens(where: str, camera: KnownCamera, photo: ScreenedPhoto) -> tuple[float,
             f"{where} is {camera.width}x{camera.height}, but the photo {photo.width}x{photo.height}: "
             f"the cameras belong to another capture; {ESTIMATE}"
         )
+    inside = 0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height
+    if not (inside and 0 < camera.fx < np.inf) or camera.distortion.keys() - {"k1", "k2"}:
+        raise AwError(
+            f"{where}: fx above 0, a centre in the photo and a distortion of k1 and k2 are needed; {ESTIMATE}"
+        )
     k1, k2 = (camera.distortion.get(key, 0.0) for key in ("k1", "k2"))
     if k2 or camera.fx != camera.fy:
         why = f"k2 is {k2:g}" if k2 else f"fx is {camera.fx:g} and fy {camera.fy:g}"
@@ -109,7 +114,7 @@ def _pose(where: str, camera: KnownCamera) -> tuple[np.ndarray, np.ndarray]:
     pose = np.array(camera.cam_from_world)
     rotation = pose[:3, :3]
     turned = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROUNDING and np.linalg.det(rotation) > 0
-    if not (np.isfinite(pose).all() and turned):
+    if not (np.isfinite(pose).all() and turned and (pose[3] == (0, 0, 0, 1)).all()):
         raise AwError(f"{where}: cam_from_world is no rotation with a translation")
     return np.roll(Rotation.from_matrix(rotation).as_quat(), 1), pose[:3, 3]
 

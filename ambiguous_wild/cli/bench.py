@@ -23,7 +23,7 @@ from ambiguous_wild.cli.run_progress import finish
 from ambiguous_wild.cli.study_file import Recorded, StudyFile, is_plan, read_study, typed_in
 from ambiguous_wild.core.config import check_limits, with_options
 from ambiguous_wild.core.errors import AwError, unknown
-from ambiguous_wild.harness.benchmark import Engine, bench, find_methods
+from ambiguous_wild.harness.benchmark import Engine, bench, check_request
 from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
@@ -223,6 +223,8 @@ def command(
         settings = (*study.settings, *settings) if typed_in(ctx, "settings") else settings
     recorded = {**ctx.params, "iterations": iterations, "budgets": budgets, "settings": settings}
     seconds = [parse_budget(budget) for budget in budgets]
+    rare, own = _rare_settings(settings)
+    wanted_effects, plan = plan_among(effects)
     prepared = None
     if suite_name is not None:
         from ambiguous_wild.datasets.suites import get_suite
@@ -235,7 +237,10 @@ def command(
         if suite.simulated is None:
             prepared = _imported(suite, root, poses, output)
         else:
-            find_methods(methods, given["plugins"], {}, 1)  # before minutes of simulation
+            parts: dict[Any, str] = {"mask": mask} if mask else {}
+            check_request(
+                methods, given["plugins"], parts, own, wanted_effects
+            )  # before minutes of simulation
             prepared = _made(suite, root, poses, output)
         scenes = tuple(prepared.scenes.values())
         protocol = protocol or (suite.protocol if suite.simulated is None else None)
@@ -245,10 +250,8 @@ def command(
     for flag, names in (("--method", methods), ("--scene", scenes)):
         if not names:
             raise AwError(f"{flag} is missing: 'aw bench --help' shows examples")
-    rare, own = _rare_settings(settings)
     train = {"resolution": resolution, "max_gaussians": max_gaussians, **rare["train"]}
     engine = {name: given.pop(name) for name in Engine.__dataclass_fields__ if name in given}
-    wanted_effects, plan = plan_among(effects)
     report = bench(
         methods,
         scenes,

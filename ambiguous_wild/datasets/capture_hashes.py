@@ -28,7 +28,8 @@ LISTED = Path(__file__).with_suffix(".yaml")
 CAPTURES = "captures"  # folder of them, in that of a suite
 RECORD = Path("truth") / "capture.json"
 CAMERAS = Path("truth") / "cameras.json"
-IMAGES = ("train", "test", "truth/distractor", "truth/clean", "truth/shadow")
+TRUTH = ("distractor", "instances", "shadow", "objects", "clean")
+IMAGES = ("train", "test", *(f"truth/{part}" for part in TRUTH))
 SUFFIXES = (".jpg", ".png")
 DIGITS = 9  # of the cameras' numbers
 
@@ -132,7 +133,7 @@ def list_lines(checked: Sequence[CheckedCapture]) -> list[str]:
         made_by = shortlist(sorted({capture.version for capture in checked if capture.differs}))
         lines.append(
             f"warning: {shortlist(other, 20)}: pixels or cameras differ from the listed ones, so results are "
-            "not comparable with the board; likely another version of numpy, OpenCV, scikit-image or "
+            "not comparable with the board; likely another version of numpy, OpenCV, scikit-image, Pillow or "
             f"ambiguous-wild ({made_by}), or another processor"
         )
     if unknown := [capture.name for capture in checked if not capture.listed]:
@@ -172,7 +173,8 @@ def suite_of_captures(folder: Path) -> Suite | None:
 
 def _width(record: Path) -> Any:
     spec = own_json(record).get("spec")
-    return spec.get("width") if isinstance(spec, dict) else None
+    width = spec.get("width") if isinstance(spec, dict) else None
+    return width if isinstance(width, int) else None
 
 
 def verify_captures(folder: Path, suite: Suite) -> VerifiedCaptures:

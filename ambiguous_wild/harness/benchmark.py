@@ -326,6 +326,21 @@ def find_methods(
     return {name if entry.given_as else entry.name: entry for name, entry in entries}
 
 
+def check_request(
+    methods: Sequence[str],
+    plugins: Sequence[PathLike],
+    parts: Mapping[GraftSlot, str],
+    settings: Sequence[str],
+    effects: Sequence[str],
+) -> None:
+    """Check what does not need a scene, before one is made; arguments and errors as of `bench`."""
+    from ambiguous_wild.harness.grid import resolved_options
+
+    entries = find_methods(methods, plugins, parts, 1)
+    _check_effects(effects, None, [], entries.values())
+    resolved_options(list(entries.values()), settings)
+
+
 def split_methods(text: str, folder: Path = Path()) -> list[str]:
     """Return the methods in a text: "a,b" are two, except in a graft with two places (a@mask=b,density=c).
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import with_options
@@ -119,11 +120,7 @@ def plan_cells(
         AwError: unknown method, option or scene; a start that no camera sees; two scenes of the same name.
     """
     named = _by_name(methods)
-    by_method = _settings_by_method(settings, list(named.values()))
-    resolved = [  # options are checked before a plan is made: making one trains
-        (entry, with_options(entry.options(), by_method[name], f"option of {entry.name}", _listed(entry)))
-        for name, entry in named.items()
-    ]
+    resolved = resolved_options(methods, settings)  # before a plan is made: making one trains
     distinct = list({path.resolve(): path for path in scenes}.values())
     loaded = [load_scene(path, factor=factor) for path in distinct]
     for scene in loaded:
@@ -177,6 +174,26 @@ def _listed(entry: MethodEntry) -> str:
     """Return where the keys of --set are listed."""
     own = f"'aw methods {entry.name}' lists them; " if dataclasses.fields(entry.options()) else ""
     return f"{own}for every method: train.KEY and engine.KEY of 'aw bench --help'"
+
+
+def resolved_options(
+    methods: Sequence[str | MethodEntry], settings: Iterable[str]
+) -> list[tuple[MethodEntry, Any]]:
+    """Return each method with its options.
+
+    Args:
+        methods: each once.
+        settings: "method.key=value" strings.
+
+    Raises:
+        AwError: unknown method or option, or a value that is none of its.
+    """
+    named = _by_name(methods)
+    by_method = _settings_by_method(settings, list(named.values()))
+    return [
+        (entry, with_options(entry.options(), by_method[name], f"option of {entry.name}", _listed(entry)))
+        for name, entry in named.items()
+    ]
 
 
 def _settings_by_method(settings: Iterable[str], entries: Sequence[MethodEntry]) -> dict[str, dict[str, str]]:

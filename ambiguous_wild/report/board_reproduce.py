@@ -24,6 +24,7 @@ from ambiguous_wild.methods.graft import graft_name, graft_pairs, split_graft
 from ambiguous_wild.methods.references import MASKS
 from ambiguous_wild.report.board import Entry, hidden_in
 from ambiguous_wild.simulate.presets import PRESETS, resized
+from ambiguous_wild.simulate.spec import CaptureSpec
 from ambiguous_wild.simulate.spec_file import plain_spec
 
 # options of `aw build-scene`
@@ -230,11 +231,7 @@ def _simulate(truth: Facts, name: str) -> list[str]:
         views, width = (
             spec.get(k) if spec.get(k) != getattr(preset, k) else None for k in ("train_views", "width")
         )
-        try:
-            same = json.loads(json.dumps(plain_spec(resized(preset, views, width)))) == spec
-        except (AwError, TypeError):
-            same = False
-        if same:
+        if _same_spec(preset, views, width, spec):
             size = [*(["--views", str(views)] if views else []), *(["--width", str(width)] if width else [])]
             return [shlex.join(["aw", "simulate", preset.name, *size, *end])]
     file = f"{name}.yaml"
@@ -243,6 +240,22 @@ def _simulate(truth: Facts, name: str) -> list[str]:
         f"printf %s {shlex.quote(text)} > {shlex.quote(file)}",
         shlex.join(["aw", "simulate", f"./{file}", *end]),
     ]
+
+
+def _same_spec(preset: CaptureSpec, views: int | None, width: int | None, spec: Facts) -> bool:
+    """Tell whether a preset of this size is the spec of a capture."""
+    try:
+        return bool(json.loads(json.dumps(plain_spec(resized(preset, views, width)))) == spec)
+    except (AwError, TypeError):
+        return False
+
+
+def _is_preset(truth: Facts) -> bool:
+    """Tell whether a capture is that of its preset, at another width at most."""
+    preset, spec = PRESETS.get(str(truth.get("preset"))), truth.get("spec")
+    if preset is None or not isinstance(spec, dict):
+        return False
+    return _same_spec(preset, None, spec.get("width"), spec)
 
 
 def _build(raw: str, name: str, settings: Facts) -> list[str]:
@@ -264,7 +277,8 @@ def _stated(scene: Scene) -> str:
         return name
     if not isinstance(truth.get("preset"), str):
         return ""
-    return simulated_dataset(truth, scene.info.get("factor")) or SIMULATED
+    dataset = simulated_dataset(truth, scene.info.get("factor"))
+    return dataset if dataset and _is_preset(truth) else SIMULATED
 
 
 def _has_exact_poses(scene: Scene) -> bool:

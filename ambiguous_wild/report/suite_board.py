@@ -74,12 +74,16 @@ def suite_board(
         AwError: no finished run, or the board is damaged.
     """
     suite = prepared.suite
-    own, settings, other = _own(read_runs(folder), prepared, factor)
+    hashes = {
+        name: scene_identity(load_scene(scene, factor=factor, verify=False, check=False))
+        for name, scene in prepared.scenes.items()
+    }
+    own, settings, other = _own(read_runs(folder), hashes)
     if not any(method.scenes for method in own):
         raise AwError(f"{folder} has no finished run of {suite.name}")
     seeds = {seed for method in own for of in method.scenes.values() for seed in of}
     dataset = dataset_of(suite.dataset, prepared.exact_poses)
-    rows, notes = _of_board(board, dataset, suite.scenes, settings, seeds, factor or suite.factor)
+    rows, notes = _of_board(board, dataset, hashes, settings, seeds, factor or suite.factor)
     notes = [*other, *notes]
     table = _table(prepared, dataset, own, rows)
     pairs = _differences(own, rows, suite.scenes)
@@ -92,14 +96,8 @@ def find_board() -> Path | None:
     return next((place for place in places if measured(place).is_dir()), None)
 
 
-def _own(
-    runs: Runs, prepared: PreparedSuite, factor: int | None
-) -> tuple[list[MethodScores], dict[str, set[str]], list[str]]:
+def _own(runs: Runs, hashes: Mapping[str, str]) -> tuple[list[MethodScores], dict[str, set[str]], list[str]]:
     """Return our methods, the settings of their runs by scene, and a line on runs that are left out."""
-    hashes = {
-        name: scene_identity(load_scene(scene, factor=factor, verify=False, check=False))
-        for name, scene in prepared.scenes.items()
-    }
     images = runs.images[runs.images["metric"] == "psnr"]
     psnr = {
         key: stats.mean(of.to_numpy()) for key, of in images.groupby(["scene", "method", "seed"])["value"]
@@ -132,7 +130,7 @@ def _own(
 def _of_board(
     board: Path | None,
     dataset: str,
-    scenes: Sequence[str],
+    scenes: Mapping[str, str],  # name -> hash
     settings: Mapping[str, set[str]],
     seeds: set[int],
     factor: int,
@@ -171,7 +169,13 @@ def _of_board(
         else:
             methods.append(method)
     left = [f"{counted(count, 'run')} {reason}" for reason, count in why.most_common()]
-    return methods, [f"of the board left out: {shortlist(left, 6)}"] if left else []
+    notes = [f"of the board left out: {shortlist(left, 6)}"] if left else []
+    if other := sorted({entry.scene for entry in fitting if entry.scene_hash != scenes[entry.scene]}):
+        notes.append(
+            f"the board's {shortlist(other, 20)}: with other estimated poses than here, or from "
+            "another version; differences include those of the scenes"
+        )
+    return methods, notes
 
 
 def _has_masks(entry: Entry) -> bool:

@@ -24,6 +24,7 @@ _SAME_PLACE_SHARE = 0.15  # largest share of the photos with one distractor at t
 _APART_M = 0.75
 _CLEARANCE_M = {"car": 1.2}  # distance from static objects; other distractors keep 0.3 m
 _PREVIEW_PX = 96
+_FACES_DEG = {"car": 0.0}  # where it faces before it is turned; others face -y, at -90 degrees
 _STRIDES_M = 0.35  # strides of a walker per metre
 # A followed person sways: angle to either side; cycles per photo of the sway, the distance and the stride.
 _SWAY_DEG, _SWAY, _NEARING, _STEPS = 7.0, 0.07, 0.045, 0.13
@@ -50,7 +51,7 @@ def shapes_of(distractor: Distractor, placement: DistractorPose, plan: GroundPla
     owner = placement.which + 1
     if not distractor.blur_m:
         return placed(parts, at, placement.yaw_deg, distractor.size, owner=owner)
-    facing = np.deg2rad(placement.yaw_deg) - np.pi / 2  # figures face -y
+    facing = np.deg2rad(placement.yaw_deg + _FACES_DEG.get(distractor.kind, -90.0))
     shapes = []
     for instant in range(INSTANTS):
         way = distractor.blur_m * ((instant + 0.5) / INSTANTS - 0.5)
@@ -115,8 +116,8 @@ def lay_out(
 
     Layouts are drawn until the occlusion, measured in a small preview, lies in ``spec.occlusion``; if none
     does, the nearest one is taken. Who is present is drawn for each layout, or once a photo if the range
-    starts at 0. No distractor is at one place in more than 15 % of the photos, as it would be part of the
-    scene.
+    starts at 0. No distractor with path "elsewhere" is at one place in more than 15 % of the photos, as it
+    would be part of the scene.
     """
     chosen: list[tuple[DistractorPose, ...]] = []
     static = world.table()
@@ -216,7 +217,7 @@ def _walker_placement(which: int, distractor: Distractor, progress: float) -> Di
     share = (gone - legs[:leg].sum()) / max(legs[leg], 1e-9)
     x, y = corners[leg] + share * (corners[leg + 1] - corners[leg])
     ahead = (corners[leg + 1] - corners[leg]) * (1 if there else -1)
-    yaw = np.rad2deg(np.arctan2(ahead[1], ahead[0])) + 90.0  # figures face -y
+    yaw = np.rad2deg(np.arctan2(ahead[1], ahead[0])) - _FACES_DEG.get(distractor.kind, -90.0)
     stride = 0.5 + 0.5 * np.sin(2 * np.pi * _STRIDES_M * 2 * distractor.laps * progress * legs.sum())
     return DistractorPose(which, float(x), float(y), float(yaw), float(stride))
 

@@ -54,7 +54,8 @@ class RenderedPhoto:
     clean: np.ndarray  # [H, W, 3] uint8, without distractors and moving shadow, before JPEG
     owner: np.ndarray  # [H, W] uint8: number of the first distractor in the pixel, 0 = none; or `FIXED`
     shadow: np.ndarray | None  # [H, W] bool, as in `TracedPhoto`
-    things: np.ndarray  # [H, W] uint8: number of the static object in the middle of the pixel, 0 = none
+    # [H, W] uint8: number of the static object in the middle of the pixel, 0 = none; of a train photo
+    things: np.ndarray
     effects: DrawnEffects
 
 
@@ -128,7 +129,8 @@ def finish_photo(
         quality = fx.draw_jpeg(effects.jpeg, random)
         pixels = fx.jpeg(pixels, quality)
         drawn["jpeg"] = {"quality": quality}
-    return RenderedPhoto(pixels, clean_pixels, owner, shadow, _things(prepared, planned.camera), drawn)
+    things = _things(prepared, planned.camera) if planned.split == "train" else np.zeros_like(owner)
+    return RenderedPhoto(pixels, clean_pixels, owner, shadow, things, drawn)
 
 
 def _things(prepared: PreparedPhoto, camera: Camera) -> np.ndarray:

@@ -30,7 +30,9 @@ from ambiguous_wild.simulate.spec import (
 )
 
 PICTURES = tuple(f"poster_{name}" for name in POSTERS)
-MAX_DISTRACTORS = 255  # the ray caster stores a pixel's distractor in a byte
+MAX_DISTRACTORS = 254  # a pixel's distractor is stored in a byte; 255 is what is fixed to the camera
+MAX_THINGS = 200  # a pixel's static object is stored in a byte; places have up to 20 of their own
+_LEAST_PANE_M = 0.15  # with a frame of 5 cm
 KINDS: dict[str, type] = {
     name: next(kind for kind in typing.get_args(hint) if kind is not type(None))
     for name, hint in typing.get_type_hints(Effects).items()
@@ -195,6 +197,13 @@ def check_spec(spec: CaptureSpec) -> CaptureSpec:
         if distractor.name in (d.name for d in spec.distractors[:k]):
             raise AwError(f"distractors[{k}].name: {distractor.name!a} occurs twice; give each its own")
         _distractor(f"distractors[{k}].", distractor, plan)
+        if distractor.blur_m and math.isqrt(spec.samples) % 2:
+            raise AwError(
+                f"distractors[{k}].blur_m: four neighbouring rays see four instants, so samples must be 4, "
+                f"16, 36 or 64, got {spec.samples}"
+            )
+    if len(spec.world.things) > MAX_THINGS:
+        raise AwError(f"world.things: at most {MAX_THINGS}, got {len(spec.world.things)}")
     for k, thing in enumerate(spec.world.things):
         _thing(f"world.things[{k}].", thing, plan)
     for name, limits in _EFFECTS.items():
@@ -250,6 +259,10 @@ def _thing(where: str, thing: Thing, plan: GroundPlan) -> None:
     known = (*TEXTURES, *PICTURES, *plan.surfaces) if thing.kind == "board" else TEXTURES
     _texture(f"{where}texture", thing.texture, known)
     _within(where, thing, _THING)
+    if thing.kind in ("mirror", "glass") and min(thing.size_m[0], thing.size_m[2]) < _LEAST_PANE_M:
+        raise AwError(
+            f"{where}size_m: a {thing.kind} with its frame is at least {_LEAST_PANE_M:g} m wide and high"
+        )
     for axis, value, limits in zip("xyz", thing.at_m, (plan.x_m, plan.y_m, (0.0, 4.0))):
         _between(f"{where}at_m {axis}", value, *limits)
 

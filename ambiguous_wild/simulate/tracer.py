@@ -367,8 +367,6 @@ def _tile(view, box, near, static, movers, shadow_casters, mirrors, every, atlas
                             t, s = pane, -1
                             z_sum += t * z
                             found = mirrored_owner
-                        else:
-                            pane = min(pane, t)
                 if s >= 0:
                     lit, clear = shade(
                         static, s, t, o, d, spread, atlas, light, sample, static, static, shadow_casters

@@ -18,12 +18,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import mean
 
+import numpy as np
+from scipy.stats import kendalltau
+
 from ambiguous_wild.datasets.suites import get_suite, measured_ambiguity
 from ambiguous_wild.simulate.presets import preset
 
 ROOT = Path(__file__).parents[1]
 RANKED = ("3dgs", "dronesplat", "robustsplat", "refinesplat")
 METHODS = (*RANKED, "3dgs+truth")
+REFERENCES = ("3dgs+truth", "3dgs-clean")
 RANKED_ON = ("aw-sim", "composites")
 SUITE = get_suite("aw-sim").tables
 PASTED = ("cutouts", "patches")
@@ -145,11 +149,59 @@ def ranking(found: Board, groups: Sequence[Sequence[str]]) -> list[tuple[str, li
     return [(name, [f"{x:.2f}" for x in psnr[name]]) for name in best]
 
 
+def agreement() -> list[str]:
+    """Kendall's tau of the order of methods on the suite and on composites, by kind of ambiguity."""
+    simulated, pasted = board("aw-sim", only="0"), board("composites", only="0")
+    lines = []
+    for kind, scenes in {
+        **SUITE,
+        "all": [s for k, of in SUITE.items() if k != "control" for s in of],
+    }.items():
+        for label_, wanted in (
+            ("all composites", sorted(pasted)),
+            ("monstree-cutouts", ["monstree-cutouts"]),
+        ):
+            names = [
+                name
+                for name in simulated[scenes[0]]
+                if name not in REFERENCES
+                and all(name in simulated[s] for s in scenes)
+                and all(name in pasted[s] for s in wanted)
+            ]
+            ours = np.array([[simulated[s][name]["psnr"] for s in scenes] for name in names])
+            theirs = np.array([[pasted[s][name]["psnr"] for s in wanted] for name in names])
+            tau, low, high = tau_interval(ours, theirs)
+            lines.append(line([kind, label_, str(len(names)), f"{tau:.2f}", f"{low:.2f} to {high:.2f}"]))
+    return lines
+
+
+def tau_interval(first: np.ndarray, second: np.ndarray, draws: int = 2000) -> tuple[float, float, float]:
+    """Kendall's tau-b of the mean values of methods, and its 95 % bootstrap interval over scenes of both.
+
+    Args:
+        first, second: [methods, scenes].
+        draws: resamples.
+    """
+    rng = np.random.default_rng(0)
+
+    def tau(a: np.ndarray, b: np.ndarray) -> float:
+        return float(kendalltau(a.mean(1), b.mean(1)).statistic)
+
+    def resampled(values: np.ndarray) -> np.ndarray:
+        return values[:, rng.integers(values.shape[1], size=values.shape[1])]
+
+    low, high = np.nanquantile(
+        [tau(resampled(first), resampled(second)) for _ in range(draws)], (0.025, 0.975)
+    )
+    return tau(first, second), float(low), float(high)
+
+
 TABLES: dict[str, dict[str, Callable[[], list[str]]]] = {
     "README.md": {"means": means},
     "docs/datasets.md": {"suite": suite},
     "docs/refinesplat.md": {"scenes": scenes},
     "docs/baselines.md": {"baselines": baselines, "colours": colours},
+    "docs/leaderboard.md": {"agreement": agreement},
 }
 
 

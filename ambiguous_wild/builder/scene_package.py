@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ambiguous_wild.builder.records import KeyedRecord, PackageResult, SceneRecord
+from ambiguous_wild.builder.resample import TRUTH_PARTS
 from ambiguous_wild.core.scene import FileEntry
 from ambiguous_wild.io.files import sha256_file, write_json
 from ambiguous_wild.io.scene_folder import SCENE_SCHEMA
@@ -42,7 +43,8 @@ def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool,
     begun = time.perf_counter()
     folder.mkdir()
     copies = (f"images_{parts.factor}",) if parts.factor > 1 else ()
-    for name in ("images", *copies, "sparse/0", "truth/distractor", "truth/clean"):
+    truth = (f"truth/{part}" for part in TRUTH_PARTS)
+    for name in ("images", *copies, "sparse/0", *truth):
         if (parts.resampled / name).is_dir():
             _add_folder(parts.resampled / name, folder / name, link)
     masks = parts.resampled / "masks"

@@ -23,7 +23,7 @@ from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, installed
 from ambiguous_wild.io.files import atomic_dir, own_json, write_json
 
-BUILDER = 25  # raised when a stage gives another result for the same input
+BUILDER = 26  # raised when a stage gives another result for the same input
 _LIBRARIES = ("pycolmap", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "numpy")
 _RESULT = "stage.json"
 _MIN_FREE = 2**20  # bytes; with less, a stage that fails is taken to fail for lack of space

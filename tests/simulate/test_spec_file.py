@@ -85,6 +85,20 @@ def simulated(folder: Path, text: str) -> Result:
             "world: {things: [{kind: box, texture: stone, at_m: [0, 0, 0], yaw_deg: 1e300}]}",
             "yaw_deg: between -360 and 360",
         ),
+        (
+            "world: {things: [{kind: mirror, texture: timber, at_m: [0, 0, 0], size_m: [1, 0.1, 0.1]}]}",
+            "world.things[0].size_m: a mirror with its frame is at least 0.15 m wide and high",
+        ),
+        (
+            "world: {things: [" + ", ".join(["{kind: box, texture: stone, at_m: [0, 0, 0]}"] * 201) + "]}",
+            "world.things: at most 200, got 201",
+        ),
+        (f"distractors: [{RED[:-1]}, blur_m: 0.2}}]\nsamples: 1", "samples must be 4, 16, 36 or 64, got 1"),
+        (f"distractors: [{RED[:-1]}, blur_m: 0.2}}]\nsamples: 9", "samples must be 4, 16, 36 or 64, got 9"),
+        (
+            f"distractors: [{RED.replace('visitor', 'ball')[:-1]}, bend_deg: 20}}]",
+            "distractors[0].bend_deg: only a visitor bends, not a ball",
+        ),
         ("designed: {effects: masks}", "designed.effects: a list"),
         ("designed: {effects: [masks, masks]}", "names each effect once"),
         ("effects: {motion_blur: {exposure_s: 1e-9}}", "exposure_s: between 1e-05 and 0.5"),
@@ -115,9 +129,9 @@ def simulated(folder: Path, text: str) -> Result:
         ),
         (
             "distractors: ["
-            + ", ".join(f"{{kind: ball, name: b{k}, texture: cloth, ambiguity: none}}" for k in range(256))
+            + ", ".join(f"{{kind: ball, name: b{k}, texture: cloth, ambiguity: none}}" for k in range(255))
             + "]",
-            "distractors: at most 255, got 256",
+            "distractors: at most 254, got 255",
         ),
     ],
 )

@@ -15,11 +15,11 @@ from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
-from ambiguous_wild.io.images import image_size, pillow
+from ambiguous_wild.io.images import image_size, pillow, read_gray
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.simulate.capture_writer import simulate
 from ambiguous_wild.simulate.presets import preset, resized
-from ambiguous_wild.simulate.spec import Effects, LensDistortion
+from ambiguous_wild.simulate.spec import Effects, ExposureDrift, LensDistortion
 
 SETTINGS = BuildSettings(factor=1, mapper="truth", max_features=1500)
 SPEC = replace(resized(preset("tiny"), 6, 240), detail_px_per_m=40.0)
@@ -57,6 +57,7 @@ def test_every_photo_has_its_exact_pose(name: str, captures: dict[str, Path], tm
     assert result.info["counts"]["points"] > 50 and result.info["reprojection_error_px"] < 1.0
     assert all(photo["partners"] > 0 for photo in result.info["photos"].values())
     assert (result.scene / "motion.npz").is_file()
+    assert "evaluation" not in result.info  # the colours of all photos are the same
 
 
 def test_points_lie_on_the_surfaces(tmp_path: Path) -> None:
@@ -75,6 +76,27 @@ def test_points_lie_on_the_surfaces(tmp_path: Path) -> None:
         exact = metres[np.clip(y, 0, metres.shape[0] - 1), np.clip(x, 0, metres.shape[1] - 1)]
         errors += list(np.abs(depth / exact - 1.0))
     assert len(errors) > 100 and np.median(errors) < 0.01
+
+
+def test_test_photos_of_other_colours_are_fitted_on_their_halves(tmp_path: Path) -> None:
+    simulate(replace(SPEC, effects=Effects(exposure_drift=ExposureDrift())), tmp_path / "raw", seed=1)
+    scene = build_scene(tmp_path / "raw", tmp_path / "scene", SETTINGS, jobs=2).scene
+    assert json.loads((scene / "scene.json").read_text())["evaluation"] == {"protocol": "half"}
+
+
+@pytest.mark.parametrize("name", ["plain", "lens"])
+def test_numbers_of_the_truth_are_not_averaged(name: str, captures: dict[str, Path], tmp_path: Path) -> None:
+    scene = build_scene(captures[name], tmp_path / "scene", replace(SETTINGS, factor=2), jobs=2).scene
+    for view in load_scene(scene).train:
+        for part in ("instances", "objects"):
+            before = read_gray(captures[name] / "truth" / part / f"{Path(view.name).stem}.png")
+            after = read_gray(scene / "truth" / part / f"{Path(view.name).stem}.png")
+            assert after.shape == (view.camera.height, view.camera.width)
+            assert len(np.unique(before)) > 2 and np.isin(after, before).all()
+            if name == "plain":  # one of the four that lie in the pixel
+                height, width = after.shape
+                four = before[: 2 * height, : 2 * width].reshape(height, 2, width, 2)
+                assert (four == after[:, None, :, None]).any((1, 3)).all()
 
 
 def photos_of(capture: Path) -> list[ScreenedPhoto]:
@@ -118,6 +140,15 @@ def spoilt(change, captures: dict[str, Path], tmp_path: Path) -> Path:
             "no rotation with a translation",
         ),
         (lambda c: c["IMG_0002.jpg"].update(cam_from_world=[[1.0]]), "no matrix of 4x4"),
+        (
+            lambda c: c["IMG_0002.jpg"]["cam_from_world"].__setitem__(3, [0.0, 0.0, 0.0, 2.0]),
+            "no rotation with a translation",
+        ),
+        (lambda c: c["IMG_0002.jpg"].update(fx=0.0, fy=0.0), "fx above 0"),
+        (lambda c: c["IMG_0002.jpg"].update(fx=-200.0, fy=-200.0), "fx above 0"),
+        (lambda c: c["IMG_0002.jpg"].update(cx=241.0), "a centre in the photo"),
+        (lambda c: c["IMG_0002.jpg"].update(cy=-1.0), "a centre in the photo"),
+        (lambda c: c["IMG_0002.jpg"].update(distortion={"k1": -0.1, "p1": 0.0}), "a distortion of k1 and k2"),
         (lambda c: c["IMG_0002.jpg"].pop("fx"), "holds no cameras of 'aw simulate'"),
     ],
 )

@@ -11,11 +11,11 @@ from PIL import Image
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import capture_writer, shapes
 from ambiguous_wild.simulate.capture_writer import look_at
-from ambiguous_wild.simulate.distractors import lay_out
+from ambiguous_wild.simulate.distractors import DistractorPose, lay_out, shapes_of
 from ambiguous_wild.simulate.kernels import QUAD, VOLUME
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.shapes import UNSEEN, Shape, shape_table
-from ambiguous_wild.simulate.spec import PLANS, STATUES, Distractor, Thing
+from ambiguous_wild.simulate.spec import PLANS, STATUES, Distractor, Thing, WorldSpec
 from ambiguous_wild.simulate.tracer import Light, build_atlas, trace
 from ambiguous_wild.simulate.world import circle_of, shapes_of_thing
 
@@ -151,6 +151,44 @@ def test_a_bent_figure_has_its_head_where_the_turn_about_its_hip_puts_it() -> No
         x, y, z = upright[k].center
         hip = 0.92
         assert bowed[k].center == pytest.approx((x, -(z - hip), hip + y))
+
+
+def front(shapes: list[Shape]) -> np.ndarray:
+    """Where a car or a person faces: away from the red lamps, or where the face is in the hair. [2] unit."""
+    centre = np.array([s.center[:2] for s in shapes])
+    red = np.array([s.tint[1] < 0.1 * s.tint[0] for s in shapes])
+    hair, face = (s.center[:2] for s in sorted(shapes, key=lambda s: -s.center[2])[:2])
+    ahead = centre.mean(0) - centre[red].mean(0) if red.any() else np.subtract(face, hair)
+    return ahead / np.linalg.norm(ahead)
+
+
+@pytest.mark.parametrize("kind", ["car", "visitor"])
+@pytest.mark.parametrize("yaw", [0.0, 70.0, -130.0])
+def test_who_is_blurred_moves_where_it_faces_during_the_exposure(kind: str, yaw: float) -> None:
+    still = Distractor("d", kind, "cloth", "none")  # type: ignore[arg-type]
+    place = DistractorPose(0, 0.5, -1.0, yaw, 0.3)
+    whole = shapes_of(still, place, PLANS["yard"])
+    moving = shapes_of(replace(still, blur_m=0.8), place, PLANS["yard"])
+    centres = np.array([[s.center for s in moving if s.instant == k] for k in range(4)])
+    assert len(moving) == 4 * len(whole)
+    assert centres.mean(0) == pytest.approx(np.array([s.center for s in whole]))
+    steps = np.diff(centres, axis=0)
+    assert steps[..., 2] == pytest.approx(0)
+    assert steps[..., :2] == pytest.approx(np.broadcast_to(0.2 * front(whole), (3, len(whole), 2)), abs=1e-6)
+
+
+def test_a_car_that_drives_faces_its_way() -> None:
+    car = Distractor("c", "car", "enamel", "none", presence=1.0, distance_m=(0.3, 12.0), path="walk",
+                     waypoints=((-3.0, -2.0), (3.0, 1.0)))  # fmt: skip
+    spec = replace(resized(preset("walkers"), views=8, width=64), distractors=(car,), detail_px_per_m=6.0)
+    spec = replace(spec, samples=1, world=WorldSpec(furniture=False, statue=False))
+    _, shots = capture_writer.plan(spec, 0)
+    places = [shot.placements[0] for shot in shots[:8]]  # 0 to 3 there, 4 to 7 back
+    ways = np.diff([(p.x_m, p.y_m) for p in places], axis=0)
+    for k in (0, 1, 2, 4, 5, 6):
+        ahead = front(shapes_of(car, places[k], PLANS["courtyard"]))
+        assert ahead == pytest.approx(ways[k] / np.linalg.norm(ways[k]), abs=1e-6), k
+    assert ways[0] @ ways[6] < 0
 
 
 def test_one_whom_the_camera_follows_sways_in_front_of_it_and_is_seen_from_behind() -> None:

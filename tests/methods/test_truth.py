@@ -42,6 +42,26 @@ def test_the_keep_maps_are_the_truth(scenes, tmp_path):
     assert policy.facts()["masked_share"] == pytest.approx(np.mean(shares))
 
 
+def test_shadows_of_distractors_are_masked_too(scenes, tmp_path):
+    scene = shutil.copytree(scenes[0], tmp_path / "scene")
+    (scene / "truth" / "shadow").mkdir()
+    for at, name in enumerate(TRAIN):
+        shadow = np.zeros((48, 64), np.uint8)
+        shadow[24:30, 4 * at : 4 * at + 20] = 255  # in part on the distractor
+        cv2.imwrite(str(scene / "truth" / "shadow" / name), shadow)
+    data = data_of(scene, tmp_path / "cache")
+    policy = parts_of("3dgs@mask=truth").mask
+    policy.setup(data)
+    for view, name in enumerate(TRAIN):
+        both = [cv2.imread(str(scene / "truth" / part / name), 0) > 0 for part in ("distractor", "shadow")]
+        assert (both[0] & both[1]).any() and (both[1] & ~both[0]).any()
+        keep = policy.keep(step_of(data, view, data.photos[view], iteration=1, nominal=0.0))
+        assert np.array_equal(keep.numpy() == 0, both[0] | both[1])
+    (scene / "truth" / "shadow" / TRAIN[1]).unlink()
+    with pytest.raises(AwError, match=f"1 of 6 .*shadow: {TRAIN[1]}"):
+        policy.setup(data)
+
+
 @pytest.mark.parametrize("dilation", [0, 1, 4])
 def test_dilation_grows_every_side(dilation):
     mask = np.zeros((20, 30), bool)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -174,6 +175,41 @@ def test_of_a_simulated_capture_they_do_too(simulated: Path) -> None:
     compare(simulated, None)
 
 
+def number(root: Path) -> None:
+    """Give the planted scene numbers, as a simulated capture has: two of two halves that touch."""
+    for part in ("instances", "objects"):
+        (root / "truth" / part).mkdir()
+    for k, name in enumerate(TRAIN):
+        movers, still = np.zeros((H, W), np.uint8), np.zeros((H, W), np.uint8)
+        movers[8:60, 10 + 4 * k : 60 + 4 * k] = 2
+        movers[10:50, 100 + 3 * k : 118 + 3 * k] = 3
+        movers[10:50, 118 + 3 * k : 140 + 3 * k] = 1
+        still[OBJECT] = 9
+        still[OBJECT[0], 10:26] = 4
+        still[0:20, 100:150] = 5  # partly behind a distractor
+        cv2.imwrite(str(root / "truth/instances" / name), movers)
+        cv2.imwrite(str(root / "truth/objects" / name), still)
+
+
+def test_numbers_of_a_capture_tell_what_touches_apart(tmp_path: Path) -> None:
+    root, objects = plant(tmp_path / "scene", "both")
+    number(root)
+    compare(root, None)
+    scene = load_scene(root)
+    masks = ambiguity_sources.find_masks(scene, None, None)
+    behind = ambiguity_sources.find_background(scene, None, None, masks)
+    measured = ambiguity_measure.measure(scene, masks, behind)
+    sizes = {1: 40 * 22, 2: 52 * 50, 3: 40 * 18}
+    assert measured.objects
+    for photo in measured.photos:
+        assert {d.label: d.pixels for d in photo.distractors} == sizes
+    # a user's own masks are other distractors, which have no numbers
+    shutil.copytree(root / "truth/distractor", tmp_path / "own")
+    own = ambiguity_sources.find_masks(scene, str(tmp_path / "own"), None)
+    measured = ambiguity_measure.measure(scene, own, behind, objects=objects)
+    assert {len(photo.distractors) for photo in measured.photos} == {2}
+
+
 def compare(root: Path, objects: Path | None) -> None:
     """The report's semantic numbers against loops over pixels and regions."""
     facts = report(root, objects)[SEMANTIC]
@@ -204,11 +240,14 @@ def compare(root: Path, objects: Path | None) -> None:
     moving, still, every = [], [], []
     for k, name in enumerate(names):
         distractor = cv2.imread(str(root / "truth/distractor" / name), 0) > 127
-        moving.append(parts(k, ndimage.label(distractor)[0]))
+        numbers = [cv2.imread(str(root / "truth" / part / name), 0) for part in ("instances", "objects")]
+        moving.append(parts(k, ndimage.label(distractor)[0] if numbers[0] is None else numbers[0]))
         every.append(parts(k, np.where(distractor, 0, segments.labels(photos[k]))))
         if objects is not None:
             things = (cv2.imread(str(objects / name), 0) > 127) & ~distractor
             still.append(parts(k, ndimage.label(things)[0]))
+        elif numbers[1] is not None:
+            still.append(parts(k, np.where(distractor, 0, numbers[1])))
 
     def best(k: int, unit: np.ndarray, statics: list) -> float:
         return max(unit @ u for j, other in enumerate(statics) if j != k for _, u in other)

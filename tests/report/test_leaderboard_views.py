@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.datasets.suites import get_suite
+from ambiguous_wild.report.board import read_board
 from ambiguous_wild.report.board_edit import check, remove
 from ambiguous_wild.report.board_publish import publish, read_sources
+from ambiguous_wild.simulate.presets import PRESETS
 from tests.chromium import Browser, needs_chromium
 from tests.report.board_page import choose, column, heads, names, said, type_in
 from tests.report.board_runs import add, own_scene, write_run
@@ -107,6 +110,49 @@ def test_the_views_in_a_browser(board: Path, tmp_path: Path, width: int, scheme:
         masks(page)
         findings_stand_at_their_cells(page)
         downloads(page, files)
+        assert page.errors == []
+
+
+@needs_chromium
+def test_means_by_what_is_known_of_the_scenes_of_a_suite(tmp_path: Path) -> None:
+    """Of aw-sim alone; oracle: means over the board's own rows, by the table of the suite and by the presets."""
+    scenes = [*get_suite("aw-sim").tables["colour"][2:5], "banners", "marble", "still"]
+    for number, name in enumerate(scenes):
+        scene = own_scene(tmp_path / name)
+        for method, noise in (("3dgs", 20.0), ("refinesplat", 9.0)):
+            write_run(tmp_path / "runs", scene, method, noise=noise - number)
+    assert add(tmp_path / "board", tmp_path / "runs", dataset="aw-sim").exit_code == 0
+    write_run(tmp_path / "more", own_scene(tmp_path / "porch"))
+    write_run(tmp_path / "more", own_scene(tmp_path / "hall"))
+    assert add(tmp_path / "board", tmp_path / "more", dataset="Tiny").exit_code == 0
+    publish(tmp_path / "board", tmp_path / "site")
+    entries = read_board(tmp_path / "board")
+    kinds = {s: kind for kind, of in get_suite("aw-sim").tables.items() for s in of}
+    places = {s: PRESETS[s].world.place for s in scenes}
+
+    def means(page: Browser, groups: dict[str, str]) -> None:
+        titles = [head.split()[0] for head in heads(page, "matrix")]
+        several = [g for g in dict.fromkeys(groups.values()) if list(groups.values()).count(g) > 1]
+        assert sorted(titles) == sorted(["Method", "mean", *several, *scenes])
+        for group in several:
+            shown = dict(zip(names(page, "matrix"), column(page, titles.index(group), "matrix")))
+            for method, text in shown.items():
+                own = [e for e in entries if (e.dataset, e.method) == ("aw-sim", method)]
+                psnr = [e.quality["psnr"] for e in own if groups[e.scene] == group]
+                assert len(psnr) > 1 and text.startswith(f"{np.mean(psnr):.2f}")  # its rank follows
+
+    with Browser(tmp_path / "profile") as page:
+        page.open((tmp_path / "site" / "index.html").as_uri())
+        choose(page, "dataset", "aw-sim")
+        assert page.run("Object.keys(DATA.scenes)") == ["aw-sim"]
+        assert not page.run("document.getElementById('group-by-choice').hidden")
+        means(page, {s: kinds[s] for s in scenes})
+        choose(page, "group-by", "place")
+        means(page, places)
+        choose(page, "group-by", "occlusion")
+        choose(page, "dataset", "Tiny")
+        assert page.run("document.getElementById('group-by-choice').hidden")
+        assert [head.split()[0] for head in heads(page, "matrix")] == ["Method", "mean", "hall", "porch"]
         assert page.errors == []
 
 

@@ -8,8 +8,10 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.suites import differences, find_scenes, get_suite, scene_id, suites
 from ambiguous_wild.io.scene_folder import read_scene_json
+from ambiguous_wild.report import suite as suite_module
 from ambiguous_wild.report.papers import read_reported
-from ambiguous_wild.report.suite import prepare_suite, suite_methods, suite_tables
+from ambiguous_wild.report.suite import prepare_suite, scene_facts, suite_methods, suite_tables
+from ambiguous_wild.simulate.presets import PRESETS
 from tests.command_line import aw
 from tests.datasets import layouts
 
@@ -142,3 +144,28 @@ def test_mistakes_are_one_line(words, message, tmp_path):
     assert done.returncode == 2
     assert message in done.stderr and done.stderr.count("\n") == 1
     assert not re.search("Traceback", done.stderr) and not (tmp_path / "runs").exists()
+
+
+def test_what_is_known_of_the_scenes_of_a_simulated_suite(monkeypatch):
+    measured = {
+        scene: {"occlusion": share, "class": "both"}
+        for scene, share in {"coats": 0.149, "greys": 0.15, "marble": 0.299, "crowd": 0.3, "still": 0}.items()
+    }
+    monkeypatch.setattr(suite_module, "measured_ambiguity", lambda: measured)
+    found = scene_facts({"aw-sim", "On-the-go", "Tiny"})
+    assert found.keys() == {"aw-sim"} and scene_facts({"Tiny"}) == {}
+    facts, tables = found["aw-sim"], get_suite("aw-sim").tables
+    assert {kind: [s for s in facts if facts[s]["ambiguity"] == kind] for kind in tables} == tables
+    assert all(facts[scene]["place"] == PRESETS[scene].world.place for scene in facts)
+    assert {s: (f["occlusion"], f["covered"]) for s, f in facts.items() if s in measured} == {
+        "coats": ("below 15%", 15),
+        "greys": ("below 30%", 15),
+        "marble": ("below 30%", 30),
+        "crowd": ("30% and more", 30),
+        "still": ("below 15%", 0),
+    }
+    assert {f["verdict"] for s, f in facts.items() if s in measured} == {"both"}
+    rest = [f for s, f in facts.items() if s not in measured]
+    assert {(f["occlusion"], f["covered"], f["verdict"]) for f in rest} == {
+        ("not measured", None, "not measured")
+    }

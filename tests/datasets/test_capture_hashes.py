@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from PIL import Image
 
+from ambiguous_wild.cli.datasets import verify_command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets import capture_hashes
 from ambiguous_wild.datasets.capture_hashes import (
@@ -149,11 +151,29 @@ def test_a_folder_of_captures_is_verified_whole(capture: Path, tmp_path: Path) -
     assert suite_of_captures(tmp_path) == get_suite("aw-sim")
 
 
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_width_that_is_no_number_is_one_line(whole: bool, capture: Path, tmp_path: Path) -> None:
+    """With a whole capture beside it the folder is that of a suite, alone of none."""
+    if whole:
+        other = shutil.copytree(capture, capture.with_name("greys"))
+        change_json(other / "truth" / "capture.json", lambda f: f["spec"].update(width=480))
+    spoilt = capture.rename(capture.with_name("coats"))
+    change_json(spoilt / "truth" / "capture.json", lambda f: f["spec"].update(width=[480]))
+    done = CliRunner().invoke(verify_command, [str(tmp_path)])
+    assert isinstance(done.exception, AwError) and done.exception.exit_code == 2, done.output
+    assert "\n" not in str(done.exception) and str(tmp_path) in str(done.exception)
+    if whole:
+        damaged = verify_captures(tmp_path, get_suite("aw-sim")).damaged
+        assert "width [480], not 480" in damaged[0] and "\n" not in damaged[0]
+
+
 def test_the_list_has_hashes_of_captures_of_suites_alone() -> None:
-    known = {str(s.simulated.width): set(s.scenes) for s in simulated_suites().values() if s.simulated}
     for width, hashes in listed_hashes().items():
-        assert hashes.keys() <= known[width]
+        made = [s for s in simulated_suites().values() if s.simulated and str(s.simulated.width) == width]
+        assert hashes.keys() <= {scene for suite in made for scene in suite.scenes}
         assert all(len(digest) == 64 and int(digest, 16) for digest in hashes.values())
+        assert len(set(hashes.values())) == len(hashes)
+    assert listed_hashes()["480"].keys() == set(get_suite("aw-sim").scenes)  # what everybody is compared with
 
 
 def test_suites_of_one_dataset_compare() -> None:

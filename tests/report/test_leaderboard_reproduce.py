@@ -20,7 +20,7 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.report.board import read_board
-from ambiguous_wild.report.board_reproduce import command, preparation
+from ambiguous_wild.report.board_reproduce import Scenes, command, preparation
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.spec_file import parse_spec, plain_spec
 from ambiguous_wild.splat.train_config import TrainConfig
@@ -122,6 +122,29 @@ def test_another_spec_is_written_out(tmp_path: Path) -> None:
     subprocess.run(["bash", "-c", write], cwd=tmp_path, check=True)
     assert parse_spec((tmp_path / "own.yaml").read_text()) == spec
     assert simulate == "aw simulate ./own.yaml -o raw/own" and "\n" not in write
+
+
+@pytest.mark.parametrize(
+    ("width", "change", "factor", "dataset"),
+    [
+        (480, {}, 2, "aw-sim"),
+        (960, {}, 2, "aw-sim-large"),
+        (480, {}, 1, "simulated"),
+        (480, {"arc_deg": 33.0}, 2, "simulated"),
+        (480, {"train_views": 12}, 2, "simulated"),
+        (480, {"distractors": ()}, 2, "simulated"),
+    ],
+)
+def test_another_spec_under_the_name_of_a_suites_preset_is_not_of_the_suite(
+    width: int, change: dict, factor: int, dataset: str, tmp_path: Path
+) -> None:
+    spec = replace(resized(preset("coats"), None, width), **change)
+    scene = scene_of(tmp_path / "coats", {"preset": "coats", "seed": 5, "spec": plain_spec(spec)})
+    scene = replace(scene, info={**scene.info, "factor": factor})
+    assert Scenes().dataset(tmp_path / "run", scene, "") == dataset
+    exact = replace(scene, info={**scene.info, "chosen": {"mapper": "truth"}})
+    assert Scenes().dataset(tmp_path / "run", exact, "") == f"{dataset}, exact poses"
+    assert Scenes(dataset="Mine").dataset(tmp_path / "run", scene, "") == "Mine"
 
 
 @pytest.mark.parametrize("truth", [None, [], {}, {"spec": 3}, {"preset": "x", "seed": "0", "spec": {}}])

@@ -15,6 +15,7 @@ from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.regions import true_shadow
 from ambiguous_wild.io.images import image_size, pillow, read_gray
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.simulate.capture_writer import simulate
@@ -78,10 +79,17 @@ def test_points_lie_on_the_surfaces(tmp_path: Path) -> None:
     assert len(errors) > 100 and np.median(errors) < 0.01
 
 
-def test_test_photos_of_other_colours_are_fitted_on_their_halves(tmp_path: Path) -> None:
-    simulate(replace(SPEC, effects=Effects(exposure_drift=ExposureDrift())), tmp_path / "raw", seed=1)
+def test_a_scene_carries_its_protocol_and_the_shadows_of_its_distractors(tmp_path: Path) -> None:
+    spec = replace(SPEC, cast_shadows=True, effects=Effects(exposure_drift=ExposureDrift()))
+    simulate(spec, tmp_path / "raw", seed=1)
     scene = build_scene(tmp_path / "raw", tmp_path / "scene", SETTINGS, jobs=2).scene
     assert json.loads((scene / "scene.json").read_text())["evaluation"] == {"protocol": "half"}
+    opened = load_scene(scene)
+    for view in opened.train:
+        shadow = true_shadow(opened, view)
+        before = read_gray(tmp_path / "raw" / "truth" / "shadow" / f"{Path(view.name).stem}.png")
+        assert shadow is not None and shadow.any()
+        np.testing.assert_array_equal(shadow, before > 0)
 
 
 @pytest.mark.parametrize("name", ["plain", "lens"])

@@ -1,4 +1,4 @@
-"""Scores of masks where distractors also cast shadows. Oracle: pixels counted one by one by their definition."""
+"""Scores of masks where distractors also cast shadows. Oracle: pixels counted one by one."""
 
 from __future__ import annotations
 

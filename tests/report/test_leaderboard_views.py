@@ -115,7 +115,7 @@ def test_the_views_in_a_browser(board: Path, tmp_path: Path, width: int, scheme:
 
 @needs_chromium
 def test_means_by_what_is_known_of_the_scenes_of_a_suite(tmp_path: Path) -> None:
-    """Of aw-sim alone; oracle: means over the board's own rows, by the table of the suite and by the presets."""
+    """Of aw-sim alone. Oracle: means of the board's rows, by the table of the suite and by the presets."""
     scenes = [*get_suite("aw-sim").tables["colour"][2:5], "banners", "marble", "still"]
     for number, name in enumerate(scenes):
         scene = own_scene(tmp_path / name)

@@ -154,8 +154,15 @@ def test_masks_stay_black_and_white_and_truth_follows(tmp_path):
         write_png(tmp_path / "masks" / f"{name}.png.png", rng.integers(0, 2, (48, 64), dtype=np.uint8) * 255)
     write_png(tmp_path / "truth" / "distractor" / "a.png", np.full((48, 64), 255, np.uint8))
     write_png(tmp_path / "truth" / "clean" / "b.png", np.full((48, 64, 3), 77, np.uint8))
+    for part in ("shadow", "instances"):
+        shown = rng.integers(0, 2, (48, 64), dtype=np.uint8) * (255 if part == "shadow" else 7)
+        for name in ("a", "b"):
+            write_png(tmp_path / "truth" / part / f"{name}.png", shown)
     _, found = stage(tmp_path, tmp_path / "truth", tmp_path / "masks")
-    assert found == {"factor": 1, "truth": {"distractor": 1, "clean": 1}}
+    counts = {"distractor": 1, "shadow": 2, "instances": 2, "objects": 0, "clean": 1}
+    assert found == {"factor": 1, "truth": counts}
+    assert set(np.unique(read_gray(tmp_path / "out" / "truth" / "shadow" / "b.png"))) == {0, 255}
+    assert set(np.unique(read_gray(tmp_path / "out" / "truth" / "instances" / "a.png"))) == {0, 7}
     assert set(np.unique(read_gray(tmp_path / "out" / "masks" / "a.png"))) == {0, 255}
     assert read_gray(tmp_path / "out" / "truth" / "distractor" / "a.png").min() == 255
     assert set(np.unique(read_png_rgb(tmp_path / "out" / "truth" / "clean" / "b.png"))) == {77}

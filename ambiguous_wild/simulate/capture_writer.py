@@ -47,6 +47,7 @@ from ambiguous_wild.simulate.photo_render import (
     depth_m,
     finish_photo,
     prepare_photo,
+    things_of,
     trace_photo,
 )
 from ambiguous_wild.simulate.room import room
@@ -237,7 +238,7 @@ def simulate(
         photos = _render(spec, world, planned, seed, folder, depth, progress)
         write_json(folder / "truth" / "cameras.json", {s.name: _camera_json(spec, s.camera) for s in planned})
         files = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
-        facts = _facts(spec, seed, identity, photos)
+        facts = _facts(spec, seed, identity, photos, things_of(world))
         facts["files"] = {name: sha256_file(folder / name) for name in files}
         write_json(folder / "truth" / "capture.json", facts)
     return {**facts, "reused": False}
@@ -382,7 +383,9 @@ def _photo_facts(spec: CaptureSpec, photo: PlannedPhoto, rendered: RenderedPhoto
     return facts
 
 
-def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, PhotoTruth]) -> CaptureTruth:
+def _facts(
+    spec: CaptureSpec, seed: int, identity: str, photos: dict[str, PhotoTruth], objects: list[str]
+) -> CaptureTruth:
     shares = [p["occlusion"] for p in photos.values()]
     facts: CaptureTruth = {
         "schema": 1,
@@ -397,6 +400,7 @@ def _facts(spec: CaptureSpec, seed: int, identity: str, photos: dict[str, PhotoT
         "clean": "same camera, same effects, no distractors and no moving shadow, before JPEG",
         "test": "no distractors; of the effects only specular and lens_distortion",
         "occlusion": summary(shares),
+        "objects": objects,
         "photos": photos,
         "licence": "CC0; textures from photographs in scikit-image that are CC0 or in the public domain",
     }

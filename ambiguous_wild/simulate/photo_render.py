@@ -93,10 +93,15 @@ def prepare_photo(
     move, camera, light = _optics(effects, planned.camera, scene.light, random, drawn)
     distractors = shape_table(shapes, world.atlas)
     fixed = spec.fixed if planned.split == "train" else None
-    names = sorted({"", *(s.thing for s in world.shapes)})
+    names = ["", *things_of(world)]
     things = np.array([names.index(s.thing) for s in world.shapes], np.uint8)
     lit = replace(scene, light=light)
     return PreparedPhoto(effects, lit, camera, distractors, fixed, move, things, drawn)
+
+
+def things_of(world: World) -> list[str]:
+    """Return the names of the static objects that a distractor may be taken for; their numbers count from 1."""
+    return sorted({s.thing for s in world.shapes if s.thing})
 
 
 def trace_photo(world: World, prepared: PreparedPhoto) -> TracedPhoto:

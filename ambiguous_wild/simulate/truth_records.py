@@ -68,6 +68,7 @@ class CaptureTruth(TypedDict):
     clean: str
     test: str
     occlusion: Summary
+    objects: list[str]  # static objects, numbered from 1 in truth/objects
     photos: dict[str, PhotoTruth]
     licence: str
     evaluation: NotRequired[Evaluation]  # of captures whose photos differ in colour

@@ -67,7 +67,7 @@ def test_the_records_keep_their_keys_and_their_order(raw: Path) -> None:
     said = json.loads((raw / "truth/capture.json").read_text())
     assert list(said) == [
         "schema", "preset", "seed", "identity", "version", "spec", "designed", "mask", "clean", "test",
-        "occlusion", "photos", "licence", "files",
+        "occlusion", "objects", "photos", "licence", "files",
     ]  # fmt: skip
     placed = [d for photo in said["photos"].values() for d in photo["distractors"]]
     assert list(placed[0]) == ["distractor", "occlusion", "which", "x_m", "y_m", "yaw_deg", "pose"]

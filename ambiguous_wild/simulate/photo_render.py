@@ -100,7 +100,7 @@ def prepare_photo(
 
 
 def things_of(world: World) -> list[str]:
-    """Return the names of the static objects that a distractor may be taken for; their numbers count from 1."""
+    """Return the names of the static objects that a distractor may be taken for, numbered from 1."""
     return sorted({s.thing for s in world.shapes if s.thing})
 
 

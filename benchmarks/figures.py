@@ -41,8 +41,10 @@ GROUPS = {
     "composites on 11 photos of a facade": [f"sceaux-{kind}" for kind in PASTED],
     "composites on 12 drone photos": [f"tiny_aerial-{kind}" for kind in PASTED],
 }
-COLOURS = ("coats", "bonnet", "noon")  # captures of the suite whose colours differ between photos
-TIMED = "banners"  # capture on which every method ran alone
+# Captures on which every method has run; the suite's are to follow.
+ALL_METHODS_ON = ("simulated", "composites")
+BASELINES = ("courtyard-colour", "courtyard-plain", "monstree-cutouts")
+COLOURS = ("time-of-day", "white-balance")
 HAND_MADE = ("features=labhog", "instances=graph")  # without pretrained networks; rows need not name them
 Board = Mapping[str, Mapping[str, Mapping[str, float]]]  # scene: method: metric, the mean over seeds
 
@@ -121,27 +123,25 @@ def suite() -> list[str]:
 
 
 def baselines() -> list[str]:
-    """Mean PSNR of every method by kind of capture, and the seconds of its training, if it ran alone."""
+    """PSNR of every method on some scenes, and the time of its training on the first, if it ran alone."""
     seconds = {
         label(row): f"{float(row['cost_train_s']):.0f}"
-        for row in rows("aw-sim")
-        if (row["scene"], row["cost_alone"]) == (TIMED, "1")
+        for row in rows(*ALL_METHODS_ON)
+        if (row["scene"], row["cost_alone"]) == (BASELINES[0], "1")
     }
-    ranked = ranking(board("aw-sim", only="0"), list(SUITE.values()))
+    ranked = ranking(board(*ALL_METHODS_ON, only="0"), BASELINES)
     return [line([f"`{name}`", *psnr, seconds.get(name, "")]) for name, psnr in ranked]
 
 
 def colours() -> list[str]:
     """PSNR of every method where colours differ between photos."""
-    found = board("aw-sim", only="0")
-    return [line([f"`{name}`", *psnr]) for name, psnr in ranking(found, [[scene] for scene in COLOURS])]
+    return [line([f"`{name}`", *psnr]) for name, psnr in ranking(board("colours", only="0"), COLOURS)]
 
 
-def ranking(found: Board, groups: Sequence[Sequence[str]]) -> list[tuple[str, list[str]]]:
-    """Name and mean PSNR by group of the methods that are measured on all scenes, the best first."""
-    scenes = [scene for group in groups for scene in group]
+def ranking(found: Board, scenes: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Name and PSNR of the methods that are measured on all these scenes, the best in the mean first."""
     psnr = {
-        name: [mean(found[scene][name]["psnr"] for scene in group) for group in groups]
+        name: [found[scene][name]["psnr"] for scene in scenes]
         for name in found[scenes[0]]
         if all(name in found[scene] for scene in scenes)
     }

@@ -83,8 +83,10 @@ def parse_budget(text: str) -> float:
     "--suite",
     "suite_name",
     type=click.Choice(SUITES),
-    help="All scenes of a published table, printed beside the reported numbers; or of a suite that is simulated "
-    "here (aw-sim...), printed beside the leaderboard.",
+    metavar="NAME",
+    help="All scenes of a suite that is simulated here, printed beside the leaderboard: aw-sim, aw-sim-mini, "
+    "aw-sim-large; or of a published table, beside its numbers: ambiguous-wild, on-the-go, robustnerf, "
+    "photo-tourism, drone.",
 )
 @click.option(
     "--poses",

@@ -163,6 +163,7 @@ UNASKED = {
     "datasets/package.py": "asked a few lines before",
     "harness/job.py": "asked by the process that sent the job",
     "harness/trained_models.py": RUNS,
+    "report/suite_board.py": "runs of these scenes were made a step before",
     "simulate/composite_scene.py": "the same scene at another size",
 }
 OURS = {

@@ -82,6 +82,7 @@ PAPERS = {
     "mcmc": "https://arxiv.org/abs/2404.09591",
     "pup-3dgs": "https://arxiv.org/abs/2406.10219",
 }
+HALF = ", half images"  # in the setting of a run, see `board_reproduce.setting`
 SOURCE = "reported"
 SOURCES = "sources.json"
 REPORTED_COLUMNS = (
@@ -117,6 +118,7 @@ def facts(
     """
     order = in_order({k for e in entries for k in e.quality})
     missing = {k for e in entries for k in e.missing}
+    scenes = scene_facts({e.dataset for e in entries})
     measures: dict[str, dict[str, str | int | None]] = {
         k: {"label": LABELS.get(k, m.label), "better": m.better, "digits": m.digits}
         for k in (*order, *sorted(missing), *COSTS, "lpips_alex")
@@ -137,8 +139,8 @@ def facts(
         # name -> summary, paper, links
         "methods": {shown.get(name, name): _method(name) for name in sorted({e.method for e in entries})},
         "measures": measures,
-        "scenes": scene_facts({e.dataset for e in entries}),
-        "runs": [_run(e) | {"method": shown.get(e.method, e.method)} for e in entries],
+        "scenes": scenes,
+        "runs": [_run(e, scenes) | {"method": shown.get(e.method, e.method)} for e in entries],
         "models": dict(models),
         "images": [
             {k: v for k, v in row.items() if k not in ("sha256", "psnr")}
@@ -151,12 +153,16 @@ def facts(
     }
 
 
-def _run(e: Entry) -> Facts:
+def _run(e: Entry, scenes: Mapping[str, Mapping[str, Facts]]) -> Facts:
     quality = dict(e.quality)
     if "mask_recall" not in quality:  # the scene has no distractors: an IoU of 0 has no meaning
         quality = {k: v for k, v in quality.items() if k not in MASKS}
     alone = e.cost.get(ALONE)
+    setting = e.setting
+    if scenes.get(e.dataset, {}).get(e.scene, {}).get("half"):
+        setting = setting.replace(HALF, "")  # that of the scene, for every method, and so no other setting
     return {k: getattr(e, k) for k in COLUMNS} | {
+        "setting": setting,
         "quality": encoded(quality),
         "cost": encoded({k: v for k, v in e.cost.items() if k in COSTS}),
         "alone": None if alone is None else bool(alone),  # None: the load was not recorded

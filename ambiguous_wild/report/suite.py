@@ -111,6 +111,7 @@ def scene_facts(datasets: Collection[str]) -> dict[str, dict[str, Facts]]:
                     "occlusion": _occlusion_class(covered),
                     "covered": None if covered is None else round(100 * covered),
                     "summary": spec.summary,
+                    "half": spec.effects.changes_colours,  # measured on half of a test photo
                     "verdict": ambiguity.get("class", "not measured"),
                 }
     return found

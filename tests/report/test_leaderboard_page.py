@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,16 @@ def test_the_same_board_gives_the_same_bytes_and_copies_of_its_csvs(board: Path,
     assert sum(name.endswith(".jpg") for name in files) == 2 + 4 + 3
     aw("publish", "--board", board, "-o", tmp_path / "a")
     assert "data/reported.csv" not in content(tmp_path / "a")
+
+
+def test_halves_of_photos_where_the_scene_asks_for_them_are_no_setting_of_their_own(board: Path) -> None:
+    entry = replace(read_board(board)[0], setting="9 iterations, half images, at most 5 Gaussians")
+    shown = {}
+    for dataset, scene in (("aw-sim", "coats"), ("aw-sim", "banners"), ("Tiny", "coats")):
+        data = facts([replace(entry, dataset=dataset, scene=scene)], [], Reported(), [])
+        shown[dataset, scene] = data["runs"][0]["setting"]
+    assert shown.pop(("aw-sim", "coats")) == "9 iterations, at most 5 Gaussians"
+    assert {*shown.values()} == {entry.setting}
 
 
 def test_the_page_shows_methods_under_their_labels(board: Path, tmp_path: Path) -> None:

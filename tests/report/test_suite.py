@@ -165,6 +165,7 @@ def test_what_is_known_of_the_scenes_of_a_simulated_suite(monkeypatch):
         "still": ("below 15%", 0),
     }
     assert {f["verdict"] for s, f in facts.items() if s in measured} == {"both"}
+    assert {scene for scene in facts if facts[scene]["half"]} == {"coats", "bonnet", "noon"}
     rest = [f for s, f in facts.items() if s not in measured]
     assert {(f["occlusion"], f["covered"], f["verdict"]) for f in rest} == {
         ("not measured", None, "not measured")

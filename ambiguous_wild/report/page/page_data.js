@@ -55,8 +55,9 @@ const valueOf = (run, key) => number(Object.hasOwn(run.quality, key) ? run.quali
 const runsOf = (dataset) => DATA.runs.filter((r) => r.dataset === dataset);
 const scenesOf = (dataset) => unique(runsOf(dataset).map((r) => r.scene)).sort(byName);
 const chosenScenes = () => scenesOf(state.dataset).filter((s) => !state.off.has(s));
-/** The datasets, the one with most runs first. */
-const measuredDatasets = () => unique(DATA.runs.map((r) => r.dataset)).sort((a, b) => runsOf(b).length - runsOf(a).length || byName(a, b));
+/** The datasets: simulated suites, whose scenes are known, then the one with most runs. */
+const known = (dataset) => Number(Object.hasOwn(DATA.scenes, dataset));
+const measuredDatasets = () => unique(DATA.runs.map((r) => r.dataset)).sort((a, b) => known(b) - known(a) || runsOf(b).length - runsOf(a).length || byName(a, b));
 
 /** The options of a group's command without the method's name. */
 const changedOptions = (group) =>

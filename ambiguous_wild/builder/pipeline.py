@@ -30,6 +30,10 @@ from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_f
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO}
 
 
+class OtherSceneThere(AwError):
+    """The output is a damaged scene, or was built from something else; it may be replaced on request."""
+
+
 @dataclass(frozen=True)
 class BuildResult:
     """A finished build."""
@@ -162,15 +166,15 @@ def _existing(target: Path, stages: Stages, overwrite: bool) -> SceneRecord | No
     if info.get("build_key") == stages.build_key:
         try:
             verify_files(target, info, quick=True)
-        except AwError:
+        except AwError as error:
             if not overwrite:
-                raise
+                raise OtherSceneThere(str(error)) from error
             refuse_foreign_files(target, {"scene.json", *info.get("files", {})})
             return None
         return cast(SceneRecord, info)
     if not overwrite:
         changed = scene_record.what_changed(info.get("inputs", {}), stages.inputs)
-        raise AwError(
+        raise OtherSceneThere(
             f"{target} exists, built from other {changed}; pass --overwrite to replace it, or "
             "choose another -o"
         )

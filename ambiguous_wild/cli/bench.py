@@ -239,10 +239,9 @@ def command(
         if suite.simulated is None:
             prepared = _imported(suite, root, poses, output)
         else:
+            # Before minutes of simulation.
             parts: dict[Any, str] = {"mask": mask} if mask else {}
-            check_request(
-                methods, given["plugins"], parts, own, wanted_effects
-            )  # before minutes of simulation
+            check_request(methods, given["plugins"], parts, own, wanted_effects)
             prepared = _made(suite, root, poses, output)
         scenes = tuple(prepared.scenes.values())
         protocol = protocol or (suite.protocol if suite.simulated is None else None)

@@ -17,6 +17,7 @@ QUAD, BOX, ELLIPSOID, CAPSULE, CYLINDER, VOLUME = range(6)
 PLANAR, BY_FACE, DOME = range(3)  # texture mapping
 INSTANTS = 4  # of an exposure; each of four neighbouring rays is traced at another one
 ALWAYS = -1  # instant of what is there during the whole exposure
+CELLS = 40  # a side of the grid of shadow casters
 GLASS = 0.08  # share of the light that a pane reflects at a right angle, on both of its surfaces
 FAR = 1e30
 _STEPS = 128
@@ -202,12 +203,11 @@ def _shadowed(table, o, d, sample):
     center, radius, instants = table[2], table[4], table[11]
     frame, start, members = table[15], table[16], table[17]
     n, instant = sample
-    cells = int(math.sqrt(start.shape[1] - 1))
     a = (frame[n, 0] * o[0] + frame[n, 1] * o[1] + frame[n, 2] * o[2] - frame[n, 6]) * frame[n, 8]
     b = (frame[n, 3] * o[0] + frame[n, 4] * o[1] + frame[n, 5] * o[2] - frame[n, 7]) * frame[n, 8]
-    if not (0.0 <= a < cells and 0.0 <= b < cells):
+    if not (0.0 <= a < CELLS and 0.0 <= b < CELLS):
         return False
-    cell = int(b) * cells + int(a)
+    cell = int(b) * CELLS + int(a)
     for k in range(start[n, cell], start[n, cell + 1]):
         s = members[k]
         if instants[s] != ALWAYS and instants[s] != instant:

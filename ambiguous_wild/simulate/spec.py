@@ -287,9 +287,8 @@ class CaptureSpec:
     world: WorldSpec = field(default_factory=WorldSpec)
     effects: Effects = field(default_factory=Effects)
     fixed: FixedThing | None = None  # fixed to the camera, in every train photo, on top of `occlusion`
-    cast_shadows: bool = (
-        False  # of distractors on the scene; else what is outside of them equals the clean photo
-    )
+    # Distractors cast shadows on the scene; else what is outside of them equals the clean photo.
+    cast_shadows: bool = False
     designed: Designed = field(default_factory=Designed)
 
     @property

@@ -17,10 +17,9 @@ import numba
 import numpy as np
 
 from ambiguous_wild.core.camera import Camera
-from ambiguous_wild.simulate.kernels import FAR, kernel, nearest, reflect, shade
+from ambiguous_wild.simulate.kernels import CELLS, FAR, kernel, nearest, reflect, shade
 
 _TILE = 16
-_CELLS = 40  # a side of the grid of shadow casters
 _MAX_LEVELS = 12
 _FEW_RAYS = 20_000  # of which one thread is as fast
 
@@ -113,7 +112,7 @@ def shadow_grid(table: ShapeTable, sun: np.ndarray) -> tuple[np.ndarray, np.ndar
     which = np.flatnonzero(table.casts).astype(np.int32)
     frame = np.zeros((len(sun), 9))
     if not len(which):
-        return frame, np.zeros((len(sun), _CELLS**2 + 1), np.int32), which
+        return frame, np.zeros((len(sun), CELLS**2 + 1), np.int32), which
     radius = table.radius[which]
     listed = []
     for k, direction in enumerate(sun):
@@ -122,17 +121,17 @@ def shadow_grid(table: ShapeTable, sun: np.ndarray) -> tuple[np.ndarray, np.ndar
         axes = np.stack([first, np.cross(direction, first)])
         middle = table.center[which] @ axes.T
         low = (middle - radius[:, None]).min(0)
-        scale = (_CELLS - 1e-6) / max(float(((middle + radius[:, None]).max(0) - low).max()), 1e-9)
+        scale = (CELLS - 1e-6) / max(float(((middle + radius[:, None]).max(0) - low).max()), 1e-9)
         frame[k] = [*axes.ravel(), *low, scale]
         begin, end = (((middle + side * radius[:, None] - low) * scale).astype(int) for side in (-1, 1))
         for s, (a, b), (c, d) in zip(which, begin, end):
-            cells = (np.arange(b, d + 1)[:, None] * _CELLS + np.arange(a, c + 1)).ravel()
-            listed.append((k * _CELLS**2 + cells, np.full(len(cells), s, np.int32)))
+            cells = (np.arange(b, d + 1)[:, None] * CELLS + np.arange(a, c + 1)).ravel()
+            listed.append((k * CELLS**2 + cells, np.full(len(cells), s, np.int32)))
     cells = np.concatenate([cell for cell, _ in listed])
     shapes = np.concatenate([s for _, s in listed])
-    counts = np.bincount(cells, minlength=len(sun) * _CELLS**2)
+    counts = np.bincount(cells, minlength=len(sun) * CELLS**2)
     edges = np.concatenate([[0], np.cumsum(counts)])
-    start = np.stack([edges[k * _CELLS**2 : (k + 1) * _CELLS**2 + 1] for k in range(len(sun))])
+    start = np.stack([edges[k * CELLS**2 : (k + 1) * CELLS**2 + 1] for k in range(len(sun))])
     return frame, start.astype(np.int32), shapes[np.argsort(cells, kind="stable")]
 
 

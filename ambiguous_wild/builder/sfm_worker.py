@@ -20,8 +20,6 @@ import shutil
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -46,6 +44,7 @@ from ambiguous_wild.builder.sfm import (
     SfmJob,
     TriangulationJob,
 )
+from ambiguous_wild.core.machine import in_order
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
@@ -56,7 +55,6 @@ OCTAVES = 4  # octaves used, from the doubled photo on; features of coarser ones
 GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads
 # Positions per requested feature: COLMAP finishes the octave that exceeds its limit, so it returns more.
 POSITIONS_A_FEATURE = 1.4
-AHEAD = 2  # photos in work a thread, so that few lie in memory
 
 
 def sift(gray: np.ndarray, most: int, mask: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -123,12 +121,7 @@ def features_of(
         return name, points, words
 
     cv2.setNumThreads(1)  # a photo a thread: nothing is left to share inside one
-    with ThreadPoolExecutor(jobs) as pool:
-        todo = iter(names)
-        waiting = [pool.submit(one, name) for name in islice(todo, AHEAD * jobs)]
-        while waiting:
-            yield waiting.pop(0).result()
-            waiting += [pool.submit(one, name) for name in islice(todo, 1)]
+    yield from in_order(one, names, jobs)
 
 
 _PR_SET_PDEATHSIG = 1

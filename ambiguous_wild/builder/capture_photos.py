@@ -23,7 +23,6 @@ import numpy as np
 from ambiguous_wild import __version__
 from ambiguous_wild.builder.collect import (
     MIN_PHOTOS,
-    NO_PHOTOS,
     VIDEO_SUFFIXES,
     Capture,
     clean_stem,
@@ -36,6 +35,7 @@ from ambiguous_wild.builder.records import CapturedPhoto, CaptureRecord, FrameCo
 from ambiguous_wild.builder.screen import sharpness, without_copies
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.io.files import atomic_dir, check_output, write_json
+from ambiguous_wild.io.mask_files import NO_PHOTOS
 from ambiguous_wild.io.photos import UnreadablePhoto, read_photo
 
 QUALITY = 97  # of JPEG; video is compressed harder

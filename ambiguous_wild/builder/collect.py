@@ -15,14 +15,11 @@ from typing import Literal
 from ambiguous_wild.core.errors import AwError, counted, shortlist, similar_path
 from ambiguous_wild.io.files import natural_key, sha256_file
 from ambiguous_wild.io.images import header_size
-from ambiguous_wild.io.mask_files import MASK_FOLDERS, masks_beside_photos
+from ambiguous_wild.io.mask_files import NO_PHOTOS, masks_beside_photos
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES, UNREAD_SUFFIXES, is_photo
 
 MIN_PHOTOS = 3  # COLMAP's smallest useful model
 Side = Literal["train", "test"] | None
-NO_PHOTOS = (  # folders whose images are no photos, in upper or lower case
-    *MASK_FOLDERS, "truth", "depth", "depths", "confidence", "normals", "@eadir", "#recycle", "__macosx",
-)  # fmt: skip
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp")
 _MAX_STEM_BYTES = 120  # leaves room for prefixes of temporary files under the usual 255
 

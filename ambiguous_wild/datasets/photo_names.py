@@ -10,11 +10,10 @@ from pathlib import Path, PurePosixPath
 
 from ambiguous_wild.core.names import spelling_key
 from ambiguous_wild.io.images import header_size
-from ambiguous_wild.io.mask_files import MASK_FOLDERS
+from ambiguous_wild.io.mask_files import NO_PHOTOS
 from ambiguous_wild.io.photos import PHOTO_SUFFIXES
 
 PREFERRED = ("images", "dense/images", "dense/0/images", "input", "rgb", "photos", "")  # "": the scene's own
-NO_PHOTOS = (*MASK_FOLDERS, "depths", "depth", "normals", "truth")
 
 
 @dataclass(frozen=True)

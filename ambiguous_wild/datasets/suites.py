@@ -59,7 +59,10 @@ def scene_id(scene: str) -> str:
 @cache
 def suites() -> dict[str, Suite]:
     """Read all suites, by name."""
-    return {row["name"]: _suite(row) for row in read_mapping(FILE)["suites"]}
+    rows: dict[str, dict[str, Any]] = {}
+    for row in read_mapping(FILE)["suites"]:
+        rows[row["name"]] = {**rows.get(row.pop("like", ""), {}), **row}
+    return {name: _suite(row) for name, row in rows.items()}
 
 
 def _suite(row: Mapping[str, Any]) -> Suite:

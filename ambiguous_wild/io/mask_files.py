@@ -13,6 +13,9 @@ from ambiguous_wild.core.scene import Split
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 MASK_FOLDERS = ("masks", "mask", "segmentation", "dynamic_masks")  # of COLMAP, nerfstudio, LichtFeld
+NO_PHOTOS = (  # folders whose images are no photos, in upper or lower case
+    *MASK_FOLDERS, "truth", "depth", "depths", "confidence", "normals", "@eadir", "#recycle", "__macosx",
+)  # fmt: skip
 OWN_MASKS = "masks.json"  # marks a folder with instances of a segmentation, not keep masks
 # a.jpg.mask.png: RealityScan; a.mask.png: OpenMVS; a_mask.png: Metashape
 MARKS = (".mask", "_mask", "-mask")

@@ -7,17 +7,20 @@ and density control does not change it: it learns light, not the distractors in 
 
 Close in front of a camera lie floaters that explain one photo and that no other photo corrects. What lies in
 a camera's picture nearer than a share of the depth of its nearest SfM points becomes transparent, and density
-control, while it works, removes it.
+control, while it works, removes it. Every run leaves out the start points there that no third photo confirms:
+distractors, and wrong matches.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import Camera
+from ambiguous_wild.core import Camera, Scene
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.geometry import inside, projected
@@ -34,6 +37,7 @@ SHARE = 0.6  # share of the depth of the nearest points below which nothing belo
 NEAREST = 0.02  # quantile of depths that counts as that depth
 FEW_POINTS = 20  # cameras with fewer points are ignored
 EVERY = 50  # iterations
+SURE = 3  # train photos that must see a point, so that each is checked by others
 GONE = -9.0  # logit of opacity, so low that density control removes the Gaussian before Adam can raise it
 
 
@@ -129,13 +133,7 @@ class NearSpace(Effect):
     name = "near"
 
     def setup(self, data: TrainData) -> None:
-        xyz = data.scene.points.xyz
-        self.empty: list[tuple[Camera, float]] = []  # camera, depth up to which nothing belongs
-        for camera, seen in zip(data.cameras, tracks_of(data.scene)):
-            depth = xyz[seen] @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
-            depth = depth[depth > 0]
-            if len(depth) >= FEW_POINTS:
-                self.empty.append((camera, SHARE * float(np.quantile(depth, NEAREST))))
+        self.empty = empty_space(data.cameras, data.scene.points.xyz, tracks_of(data.scene))
 
     @torch.no_grad()
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
@@ -152,3 +150,45 @@ class NearSpace(Effect):
 
     def facts(self) -> Facts:
         return {"cameras": len(self.empty)}
+
+
+def empty_space(
+    cameras: Sequence[Camera], xyz: np.ndarray, seen: Sequence[np.ndarray]
+) -> list[tuple[Camera, float]]:
+    """Return cameras that see enough points, each with the depth up to which nothing belongs.
+
+    Args:
+        cameras: cameras of the train photos.
+        xyz: [M, 3] SfM points.
+        seen: for each camera, the rows of the points that it sees.
+    """
+    empty: list[tuple[Camera, float]] = []
+    for camera, rows in zip(cameras, seen, strict=True):
+        depth = xyz[rows] @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
+        depth = depth[depth > 0]
+        if len(depth) >= FEW_POINTS:
+            empty.append((camera, SHARE * float(np.quantile(depth, NEAREST))))
+    return empty
+
+
+def unconfirmed_in_front(scene: Scene) -> np.ndarray:
+    """Return which SfM points fewer than `SURE` train photos see, and lie in front of all sure ones, [M] bool.
+
+    "In front": in the picture of a train camera, nearer than `SHARE` of the depth of the nearest points that
+    it sees and that are sure. These are distractors that passed close to the cameras, and wrong matches.
+    Masks hide them from the loss, so training does not correct them, and a test view between the train
+    photos is veiled by them.
+    """
+    xyz, seen = scene.points.xyz, tracks_of(scene)
+    photos = np.bincount(np.concatenate([np.zeros(0, np.int64), *seen]), minlength=len(xyz))
+    sure = photos >= SURE
+    unsure, in_front = np.flatnonzero(~sure), np.zeros(len(xyz), bool)
+    cameras = [view.camera for view in scene.train]
+    for camera, depth in empty_space(cameras, xyz, [rows[sure[rows]] for rows in seen]):
+        local = camera.to_camera(xyz[unsure])
+        near = (local[:, 2] > 0) & (local[:, 2] < depth)
+        local, rows = local[near], unsure[near]
+        u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
+        v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
+        in_front[rows[(u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)]] = True
+    return in_front

@@ -172,7 +172,7 @@ def empty_space(
 
 
 def unconfirmed_in_front(scene: Scene) -> np.ndarray:
-    """Return which SfM points fewer than `SURE` train photos see, and lie in front of all sure ones, [M] bool.
+    """Return the SfM points [M] bool that few train photos see, in front of all that a photo surely shows.
 
     "In front": in the picture of a train camera, nearer than `SHARE` of the depth of the nearest points that
     it sees and that are sure. These are distractors that passed close to the cameras, and wrong matches.

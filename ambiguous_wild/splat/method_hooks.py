@@ -21,7 +21,7 @@ from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.io.mask_reasons import MaskReasons
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.effects.skybox import unconfirmed_in_front
+from ambiguous_wild.splat.effects.skybox import contradicted_points
 from ambiguous_wild.splat.fields import Fields
 from ambiguous_wild.splat.gaussians import MIN_POINTS, Gaussians
 from ambiguous_wild.splat.render import BLUR
@@ -220,7 +220,7 @@ class MethodHooks:
     # what the user gives to start from: Gaussians, or points [M, 3] with colours [M, 3] uint8
     given: Gaussians | tuple[np.ndarray, np.ndarray] | None = None
     # the first Gaussians; None = one at every point of the sparse model (without those of
-    # `unconfirmed_in_front`) and of `more_points`
+    # `contradicted_points`) and of `more_points`
     start: Callable[[TrainData], Gaussians] | None = None
     more_points: tuple[MorePoints, ...] = ()  # further points to start from; each fills the room that is left
     blur: float = BLUR  # px^2 added to both variances of a splat
@@ -253,7 +253,7 @@ class MethodHooks:
         if self.start is not None and self.given is None:
             return self.start(data)
         if self.given is None:
-            points, stay = data.scene.points, ~unconfirmed_in_front(data.scene)
+            points, stay = data.scene.points, ~contradicted_points(data.scene)
             xyz, rgb = points.xyz[stay], points.rgb[stay]
         else:
             xyz, rgb = self.given

@@ -1,4 +1,4 @@
-"""The space close before a camera is kept empty, and no training starts from what few photos show there."""
+"""The space close before a camera is kept empty; no training starts from points that photos contradict."""
 
 from types import SimpleNamespace
 
@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.scene import SparsePoints
 from ambiguous_wild.splat.effects import skybox, with_effects
-from ambiguous_wild.splat.effects.skybox import EVERY, NearSpace, unconfirmed_in_front
+from ambiguous_wild.splat.effects.skybox import EVERY, NearSpace, contradicted_points
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.training_loop import train
@@ -100,19 +100,19 @@ def test_density_control_takes_what_became_transparent(started):
 
 
 def scene_with(place, photos, wall_photos=3) -> SimpleNamespace:
-    """Three cameras 1 apart that look along z at 40 points at a depth of 10; one more point at `place`.
+    """Four train cameras 1 apart that look along z at 40 points 10 away; one more point, and a test photo.
 
     Args:
         place: position of that point.
-        photos: indices of the photos that see it; 3 is the test photo.
+        photos: indices of the photos that see it; 4 is the test photo.
         wall_photos: train photos that see each of the 40.
     """
     views = []
-    for k in range(4):
+    for k in range(5):
         pose = np.eye(4)
         pose[0, 3] = -float(k)
         camera = Camera(100, 80, 100.0, 100.0, 50.0, 40.0, pose)
-        views.append(SimpleNamespace(name=f"{k}", camera=camera, split="train" if k < 3 else "test"))
+        views.append(SimpleNamespace(name=f"{k}", camera=camera, split="train" if k < 4 else "test"))
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(-1, 1, (40, 2)), np.full(40, 10.0)])
     xyz = np.concatenate([[place], wall])
@@ -122,37 +122,38 @@ def scene_with(place, photos, wall_photos=3) -> SimpleNamespace:
         xyz, np.zeros((41, 3), np.uint8), np.zeros(41), offsets, np.concatenate(tracks),
         np.zeros((int(offsets[-1]), 2), np.float32),
     )  # fmt: skip
-    return SimpleNamespace(points=points, views=views, train=views[:3])
+    return SimpleNamespace(points=points, views=views, train=views[:4])
 
 
 @pytest.mark.parametrize(
     ("place", "photos", "left_out"),
     [
-        ((0.0, 0.0, 5.9), (0, 1), True),
-        ((0.0, 0.0, 5.9), (0, 1, 2), False),  # a third photo confirms it: something near, not a veil
-        ((0.0, 0.0, 5.9), (0, 1, 3), True),  # a test photo confirms nothing
-        ((0.0, 0.0, 5.9), (1, 1, 1), True),  # one photo, however often
-        ((0.0, 0.0, 6.1), (0, 1), False),  # six tenths of 10
-        ((-2.9, 0.0, 5.9), (1, 2), True),  # only photo 0 has it in its picture
-        ((-3.0, 0.0, 5.9), (1, 2), False),  # beside every picture
-        ((0.0, 2.4, 5.9), (0, 1), False),
-        ((0.0, 0.0, -1.0), (0, 1), False),  # behind the cameras
+        ((1.0, 0.0, 5.9), (0, 1), True),  # photos 2 and 3 do not show it
+        ((1.0, 0.0, 5.9), (0, 1, 2), False),  # a third photo confirms it: something near
+        ((1.0, 0.0, 5.9), (0, 1, 4), True),  # a test photo confirms nothing
+        ((1.0, 0.0, 5.9), (0, 0, 0), True),  # one photo, however often
+        ((1.0, 0.0, 6.1), (0, 1), False),  # six tenths of 10
+        ((-1.9, 0.0, 5.9), (2, 3), True),  # at the border of photo 1
+        ((-2.0, 0.0, 5.9), (2, 3), False),  # only photo 0 has it in its picture
+        ((1.0, 2.3, 5.9), (0, 1), True),
+        ((1.0, 2.4, 5.9), (0, 1), False),
+        ((1.0, 0.0, -1.0), (0, 1), False),  # behind the cameras
     ],
 )
-def test_training_does_not_start_from_unconfirmed_points_in_front(place, photos, left_out):
-    scene = scene_with(place, photos)
-    assert unconfirmed_in_front(scene).tolist() == [left_out] + [False] * 40
+def test_training_does_not_start_from_contradicted_points(place, photos, left_out):
+    scene = scene_with(place, photos, wall_photos=4)
+    assert contradicted_points(scene).tolist() == [left_out] + [False] * 40
     start = MethodHooks().first_gaussians(SimpleNamespace(scene=scene, device="cpu"))
     np.testing.assert_array_equal(start.means, scene.points.xyz[left_out:].astype(np.float32))
 
 
-def test_without_sure_points_all_are_started_from():
-    assert not unconfirmed_in_front(scene_with((0.0, 0.0, 1.0), (0, 1), wall_photos=2)).any()
+def test_photos_without_sure_points_contradict_nothing():
+    assert not contradicted_points(scene_with((1.0, 0.0, 5.9), (0, 1), wall_photos=2)).any()
     scan = SimpleNamespace(points=SparsePoints.without_tracks(np.ones((5, 3))), views=[], train=[])
-    assert not unconfirmed_in_front(scan).any()
+    assert not contradicted_points(scan).any()
 
 
 def test_points_of_the_user_are_all_started_from():
-    scene = scene_with((0.0, 0.0, 5.9), (0, 1))
+    scene = scene_with((1.0, 0.0, 5.9), (0, 1), wall_photos=4)
     hooks = MethodHooks(given=(scene.points.xyz, scene.points.rgb))
     assert len(hooks.first_gaussians(SimpleNamespace(scene=scene, device="cpu"))) == 41

@@ -7,8 +7,7 @@ and density control does not change it: it learns light, not the distractors in 
 
 Close in front of a camera lie floaters that explain one photo and that no other photo corrects. What lies in
 a camera's picture nearer than a share of the depth of its nearest SfM points becomes transparent, and density
-control, while it works, removes it. Every run leaves out the start points there that no third photo confirms:
-distractors, and wrong matches.
+control, while it works, removes it. Every run leaves out start points there that other photos contradict.
 """
 
 from __future__ import annotations
@@ -37,7 +36,8 @@ SHARE = 0.6  # share of the depth of the nearest points below which nothing belo
 NEAREST = 0.02  # quantile of depths that counts as that depth
 FEW_POINTS = 20  # cameras with fewer points are ignored
 EVERY = 50  # iterations
-SURE = 3  # train photos that must see a point, so that each is checked by others
+SURE = 3  # train photos that must see a point, so that each is checked by two others
+CONTRADICTIONS = 2  # photos that must contradict a point; one may have missed it
 GONE = -9.0  # logit of opacity, so low that density control removes the Gaussian before Adam can raise it
 
 
@@ -133,7 +133,9 @@ class NearSpace(Effect):
     name = "near"
 
     def setup(self, data: TrainData) -> None:
-        self.empty = empty_space(data.cameras, data.scene.points.xyz, tracks_of(data.scene))
+        depths = nearest_depths(data.cameras, data.scene.points.xyz, tracks_of(data.scene))
+        # camera, depth up to which nothing belongs
+        self.empty = [(camera, depth) for camera, depth in zip(data.cameras, depths, strict=True) if depth]
 
     @torch.no_grad()
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
@@ -152,43 +154,43 @@ class NearSpace(Effect):
         return {"cameras": len(self.empty)}
 
 
-def empty_space(
-    cameras: Sequence[Camera], xyz: np.ndarray, seen: Sequence[np.ndarray]
-) -> list[tuple[Camera, float]]:
-    """Return cameras that see enough points, each with the depth up to which nothing belongs.
+def nearest_depths(cameras: Sequence[Camera], xyz: np.ndarray, seen: Sequence[np.ndarray]) -> list[float]:
+    """Return for each camera the depth up to which nothing belongs; 0 where it sees too few points.
 
     Args:
         cameras: cameras of the train photos.
         xyz: [M, 3] SfM points.
         seen: for each camera, the rows of the points that it sees.
     """
-    empty: list[tuple[Camera, float]] = []
+    depths = []
     for camera, rows in zip(cameras, seen, strict=True):
         depth = xyz[rows] @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
         depth = depth[depth > 0]
-        if len(depth) >= FEW_POINTS:
-            empty.append((camera, SHARE * float(np.quantile(depth, NEAREST))))
-    return empty
+        depths.append(SHARE * float(np.quantile(depth, NEAREST)) if len(depth) >= FEW_POINTS else 0.0)
+    return depths
 
 
-def unconfirmed_in_front(scene: Scene) -> np.ndarray:
-    """Return the SfM points [M] bool that few train photos see, in front of all that a photo surely shows.
+def contradicted_points(scene: Scene) -> np.ndarray:
+    """Return the SfM points [M] bool that no third train photo confirms and that other photos contradict.
 
-    "In front": in the picture of a train camera, nearer than `SHARE` of the depth of the nearest points that
-    it sees and that are sure. These are distractors that passed close to the cameras, and wrong matches.
-    Masks hide them from the loss, so training does not correct them, and a test view between the train
-    photos is veiled by them.
+    A photo contradicts a point that it should show, and does not, nearer than what it surely shows: than
+    `SHARE` of the depth of its nearest points of at least `SURE` train photos. Such points are distractors
+    that passed close to the cameras, and wrong matches. Where masks hide them, the loss corrects nothing,
+    and they veil a test view between the train photos.
     """
     xyz, seen = scene.points.xyz, tracks_of(scene)
     photos = np.bincount(np.concatenate([np.zeros(0, np.int64), *seen]), minlength=len(xyz))
     sure = photos >= SURE
-    unsure, in_front = np.flatnonzero(~sure), np.zeros(len(xyz), bool)
     cameras = [view.camera for view in scene.train]
-    for camera, depth in empty_space(cameras, xyz, [rows[sure[rows]] for rows in seen]):
-        local = camera.to_camera(xyz[unsure])
+    contradictions = np.zeros(len(xyz), np.int64)
+    depths = nearest_depths(cameras, xyz, [rows[sure[rows]] for rows in seen])
+    for camera, own, depth in zip(cameras, seen, depths, strict=True):
+        asked = ~sure
+        asked[own] = False
+        rows = np.flatnonzero(asked)
+        local = camera.to_camera(xyz[rows])
         near = (local[:, 2] > 0) & (local[:, 2] < depth)
-        local, rows = local[near], unsure[near]
-        u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
-        v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
-        in_front[rows[(u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)]] = True
-    return in_front
+        (x, y, z), rows = local[near].T, rows[near]
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        contradictions[rows] += (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+    return contradictions >= CONTRADICTIONS

@@ -253,8 +253,8 @@ class MethodHooks:
         if self.start is not None and self.given is None:
             return self.start(data)
         if self.given is None:
-            points, stay = data.scene.points, ~contradicted_points(data.scene)
-            xyz, rgb = points.xyz[stay], points.rgb[stay]
+            sparse, stay = data.scene.points, ~contradicted_points(data.scene)
+            xyz, rgb = sparse.xyz[stay], sparse.rgb[stay]
         else:
             xyz, rgb = self.given
         kept = thinned(len(xyz), most)

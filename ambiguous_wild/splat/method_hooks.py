@@ -21,6 +21,7 @@ from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.io.mask_reasons import MaskReasons
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
+from ambiguous_wild.splat.effects.skybox import contradicted_points
 from ambiguous_wild.splat.fields import Fields
 from ambiguous_wild.splat.gaussians import MIN_POINTS, Gaussians
 from ambiguous_wild.splat.render import BLUR
@@ -218,7 +219,8 @@ class MethodHooks:
     start_scale: float = 1.0  # times the start size of 3DGS
     # what the user gives to start from: Gaussians, or points [M, 3] with colours [M, 3] uint8
     given: Gaussians | tuple[np.ndarray, np.ndarray] | None = None
-    # the first Gaussians; None = one at every point of the sparse model and of `more_points`
+    # the first Gaussians; None = one at every point of the sparse model (without those of
+    # `contradicted_points`) and of `more_points`
     start: Callable[[TrainData], Gaussians] | None = None
     more_points: tuple[MorePoints, ...] = ()  # further points to start from; each fills the room that is left
     blur: float = BLUR  # px^2 added to both variances of a splat
@@ -250,7 +252,11 @@ class MethodHooks:
             return self.given.select(rows).of_degree(self.sh_degree).to(data.device)
         if self.start is not None and self.given is None:
             return self.start(data)
-        xyz, rgb = self.given or (data.scene.points.xyz, data.scene.points.rgb)
+        if self.given is None:
+            sparse, stay = data.scene.points, ~contradicted_points(data.scene)
+            xyz, rgb = sparse.xyz[stay], sparse.rgb[stay]
+        else:
+            xyz, rgb = self.given
         kept = thinned(len(xyz), most)
         xyz, rgb = xyz[kept], rgb[kept]
         for points in self.more_points if len(xyz) >= MIN_POINTS else ():  # fewer are refused below

@@ -1,4 +1,4 @@
-"""The space close before a camera is kept empty."""
+"""The space close before a camera is kept empty; no training starts from points that photos contradict."""
 
 from types import SimpleNamespace
 
@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.scene import SparsePoints
 from ambiguous_wild.splat.effects import skybox, with_effects
-from ambiguous_wild.splat.effects.skybox import EVERY, NearSpace
+from ambiguous_wild.splat.effects.skybox import EVERY, NearSpace, contradicted_points
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.training_loop import train
@@ -97,3 +97,63 @@ def test_density_control_takes_what_became_transparent(started):
     train(near_space)
     assert near_space.effects.facts()["near"]["cameras"] > 0
     assert len(near_space.gaussians.means) < len(without.gaussians.means)
+
+
+def scene_with(place, photos, wall_photos=3) -> SimpleNamespace:
+    """Four train cameras 1 apart that look along z at 40 points 10 away; one more point, and a test photo.
+
+    Args:
+        place: position of that point.
+        photos: indices of the photos that see it; 4 is the test photo.
+        wall_photos: train photos that see each of the 40.
+    """
+    views = []
+    for k in range(5):
+        pose = np.eye(4)
+        pose[0, 3] = -float(k)
+        camera = Camera(100, 80, 100.0, 100.0, 50.0, 40.0, pose)
+        views.append(SimpleNamespace(name=f"{k}", camera=camera, split="train" if k < 4 else "test"))
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([rng.uniform(-1, 1, (40, 2)), np.full(40, 10.0)])
+    xyz = np.concatenate([[place], wall])
+    tracks = [np.array(photos, np.int32), *[np.arange(wall_photos, dtype=np.int32)] * 40]
+    offsets = np.cumsum([0, *map(len, tracks)])
+    points = SparsePoints(
+        xyz, np.zeros((41, 3), np.uint8), np.zeros(41), offsets, np.concatenate(tracks),
+        np.zeros((int(offsets[-1]), 2), np.float32),
+    )  # fmt: skip
+    return SimpleNamespace(points=points, views=views, train=views[:4])
+
+
+@pytest.mark.parametrize(
+    ("place", "photos", "left_out"),
+    [
+        ((1.0, 0.0, 5.9), (0, 1), True),  # photos 2 and 3 do not show it
+        ((1.0, 0.0, 5.9), (0, 1, 2), False),  # a third photo confirms it: something near
+        ((1.0, 0.0, 5.9), (0, 1, 4), True),  # a test photo confirms nothing
+        ((1.0, 0.0, 5.9), (0, 0, 0), True),  # one photo, however often
+        ((1.0, 0.0, 6.1), (0, 1), False),  # six tenths of 10
+        ((-1.9, 0.0, 5.9), (2, 3), True),  # at the border of photo 1
+        ((-2.0, 0.0, 5.9), (2, 3), False),  # only photo 0 has it in its picture
+        ((1.0, 2.3, 5.9), (0, 1), True),
+        ((1.0, 2.4, 5.9), (0, 1), False),
+        ((1.0, 0.0, -1.0), (0, 1), False),  # behind the cameras
+    ],
+)
+def test_training_does_not_start_from_contradicted_points(place, photos, left_out):
+    scene = scene_with(place, photos, wall_photos=4)
+    assert contradicted_points(scene).tolist() == [left_out] + [False] * 40
+    start = MethodHooks().first_gaussians(SimpleNamespace(scene=scene, device="cpu"))
+    np.testing.assert_array_equal(start.means, scene.points.xyz[left_out:].astype(np.float32))
+
+
+def test_photos_without_sure_points_contradict_nothing():
+    assert not contradicted_points(scene_with((1.0, 0.0, 5.9), (0, 1), wall_photos=2)).any()
+    scan = SimpleNamespace(points=SparsePoints.without_tracks(np.ones((5, 3))), views=[], train=[])
+    assert not contradicted_points(scan).any()
+
+
+def test_points_of_the_user_are_all_started_from():
+    scene = scene_with((1.0, 0.0, 5.9), (0, 1), wall_photos=4)
+    hooks = MethodHooks(given=(scene.points.xyz, scene.points.rgb))
+    assert len(hooks.first_gaussians(SimpleNamespace(scene=scene, device="cpu"))) == 41

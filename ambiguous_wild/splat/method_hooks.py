@@ -21,7 +21,7 @@ from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.io.mask_reasons import MaskReasons
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.effects.skybox import contradicted_points
+from ambiguous_wild.splat.effects.near_space import contradicted_points
 from ambiguous_wild.splat.fields import Fields
 from ambiguous_wild.splat.gaussians import MIN_POINTS, Gaussians
 from ambiguous_wild.splat.render import BLUR

@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.scene import SparsePoints
 from ambiguous_wild.splat.effects import skybox, with_effects
-from ambiguous_wild.splat.effects.skybox import EVERY, NearSpace, contradicted_points
+from ambiguous_wild.splat.effects.near_space import EVERY, NearSpace, contradicted_points
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.training_loop import train

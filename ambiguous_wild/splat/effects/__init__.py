@@ -28,7 +28,7 @@ ALL = tuple(EFFECTS)
 INITIALISATIONS = {
     "skybox": ("skybox", "Skybox"),  # on a far sphere too, for what lies behind the scene
     "dense": ("dense", "DenseStart"),  # on dense points too, for few photos
-    "near": ("skybox", "NearSpace"),  # none close in front of a camera
+    "near": ("near_space", "NearSpace"),  # none close in front of a camera
 }
 SH_DEGREES = {"sh0": 0, "sh1": 1, "sh2": 2}  # highest degree of the harmonics; 0: equal in all directions
 NAMES = (*EFFECTS, *INITIALISATIONS, *SH_DEGREES)  # all that --effects takes

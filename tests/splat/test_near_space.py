@@ -8,7 +8,7 @@ import torch
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.scene import SparsePoints
-from ambiguous_wild.splat.effects import skybox, with_effects
+from ambiguous_wild.splat.effects import near_space, with_effects
 from ambiguous_wild.splat.effects.near_space import EVERY, NearSpace, contradicted_points
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
@@ -79,10 +79,10 @@ def test_it_becomes_transparent_at_intervals():
 @pytest.fixture
 def started(scene, tmp_path, monkeypatch):
     """Makes a trainer whose cameras see all points of the wall; nothing belongs before the wall."""
-    monkeypatch.setattr(skybox, "FEW_POINTS", 1)
-    monkeypatch.setattr(skybox, "SHARE", 1.0)  # Gaussians that leave the wall are in the way
+    monkeypatch.setattr(near_space, "FEW_POINTS", 1)
+    monkeypatch.setattr(near_space, "SHARE", 1.0)  # Gaussians that leave the wall are in the way
     every = lambda scene: [np.arange(len(scene.points))] * len(scene.train)  # noqa: E731
-    monkeypatch.setattr(skybox, "tracks_of", every)  # the tiny scene has no tracks
+    monkeypatch.setattr(near_space, "tracks_of", every)  # the tiny scene has no tracks
 
     def start(folder, effects=("near",), iterations=260):
         parts = with_effects(MethodHooks(), list(effects))

@@ -151,7 +151,8 @@ parser.add_argument("-o", "--output", type=pathlib.Path)
 for option in ["-n", "--densify-from", "--refine-every", "--sh-degree-interval", {newer}]:
     parser.add_argument(option, type=int)
 given = parser.parse_args()
-assert all((given.scene / "sparse/0" / name).is_file() for name in ("cameras.bin", "images.bin", "points3D.bin"))
+model = {{path.name for path in (given.scene / "sparse/0").iterdir()}}
+assert model >= {{"cameras.bin", "images.bin", "points3D.bin"}}
 assert sorted(path.name for path in (given.scene / "images").iterdir()) == {photos}
 shutil.copyfile({splats!r}, given.output)
 given.output.with_name("given.json").write_text(json.dumps(vars(given), default=str))
@@ -166,9 +167,7 @@ def opensplat(model, tmp_path, monkeypatch):
         program = tmp_path / "bin" / "opensplat"
         program.parent.mkdir()
         program.write_text(
-            OPENSPLAT.format(
-                python=sys.executable, newer=newer, photos=sorted(TRAIN), splats=str(model[1])
-            )
+            OPENSPLAT.format(python=sys.executable, newer=newer, photos=sorted(TRAIN), splats=str(model[1]))
         )
         program.chmod(0o755)
         monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")

@@ -29,7 +29,7 @@ from ambiguous_wild.io.files import folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.entry import trained_once
 from ambiguous_wild.methods.graft import graft_pairs, split_graft
-from ambiguous_wild.methods.references import MASKS, NERFBASELINES, reference_file, with_file
+from ambiguous_wild.methods.references import EXTERNAL, MASKS, NERFBASELINES, reference_file, with_file
 from ambiguous_wild.methods.registry import get_method, load_plugin, load_reference
 from ambiguous_wild.splat.train_config import TrainConfig
 
@@ -76,7 +76,7 @@ def read_sources(
             file = reference_file(member)
             if file is not None:
                 sources.append(_source(member, "method", file))
-            elif member.startswith((NERFBASELINES, MASKS)):
+            elif member.startswith((EXTERNAL, NERFBASELINES, MASKS)):
                 sources.append(CodeSource(member, "method"))
     return tuple(sources)
 

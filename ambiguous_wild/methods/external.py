@@ -34,6 +34,7 @@ from ambiguous_wild.methods.external_process import (
     Produced,
     Task,
     end_left_over,
+    last_line,
     no_parts,
     run_logged,
     split_lists,
@@ -45,7 +46,7 @@ COMMANDS = ("train", "render", "resume")
 BEGUN = "begun.json"  # in the program's folder: the command that was started, which `resume` must match
 RUN = ("scene", "source", "images", "output", "seed", "iterations", "budget_s", "factor", "device")
 VIEW = ("stem", "name", "index")
-_WITHOUT_INFLUENCE = ("summary", "paper", "needs", "timeout_h")  # keys that do not change the result
+_WITHOUT_INFLUENCE = ("summary", "paper", "needs", "version", "timeout_h")  # keys without influence
 _ADDED = {"photos": "all", "drawn_by": "program"}  # keys of later versions, with their defaults
 _CODE = (".py", ".sh", ".yaml", ".yml", ".toml", ".json")  # other files may be logs, weights or builds
 LISTS = ("train_names", "test_names", "train_stems", "test_stems")
@@ -162,6 +163,7 @@ class CommandProgram:
             state = task.work / DONE
             done: dict[str, float] = _read(state)
             output = self._output(task)
+            revision = self._revision(values, task)
             if "train_s" not in done:
                 resuming = self._may_resume(task, output)
                 if not resuming:
@@ -175,7 +177,7 @@ class CommandProgram:
             if self.keys.render and "render_s" not in done:
                 done["render_s"] = self._command("render", "render", values, task)
                 write_json(state, done)
-            return self._collect(task, values, done)
+            return self._collect(task, values, done, revision)
         finally:
             shutil.rmtree(staged, ignore_errors=True)
 
@@ -227,7 +229,16 @@ class CommandProgram:
             timeout_s=self.keys.timeout_h * 3600.0 or None,
         )
 
-    def _collect(self, task: Task, values: dict[str, object], done: dict[str, float]) -> Produced:
+    def _revision(self, values: dict[str, object], task: Task) -> str | None:
+        """Return what the program calls its version; else the commit of `cwd`, unless that is our own."""
+        if not self.keys.version:
+            return git_commit(self.cwd) if self.cwd != PACKAGED.resolve() else None
+        self._command("version", "version", values, task)
+        return last_line(task.logs / "version.log")
+
+    def _collect(
+        self, task: Task, values: dict[str, object], done: dict[str, float], revision: str | None
+    ) -> Produced:
         tests, trains = task.scene.test, task.scene.train
         drawn = [] if self.drawn_by_us else list(enumerate(tests))
         renders = {view.name: self._find(self.keys.renders, values, view, i) for i, view in drawn}
@@ -257,13 +268,9 @@ class CommandProgram:
             ply=ply,
             drawn_by_us=self.drawn_by_us,
             cost=cost,
-            facts=self._facts(),
+            # the settings of the run that the commands do not pass
+            facts={"revision": revision, "not_told": sorted({"seed", "iterations"} - self._used())},
         )
-
-    def _facts(self) -> Facts:
-        """Return the program's revision, and the settings of the run that its commands do not pass."""
-        not_passed = sorted({"seed", "iterations"} - self._used())
-        return {"revision": git_commit(self.cwd), "not_told": not_passed}
 
     def _pattern(self, template: str, values: dict[str, object], view: View, index: int) -> str:
         stem = str(PurePosixPath(view.name).with_suffix(""))
@@ -301,6 +308,7 @@ class Description:
     train: str | tuple[str, ...] = ()
     render: str | tuple[str, ...] = ()  # not needed if the train command renders
     resume: str | tuple[str, ...] = ()  # instead of train, if a stopped run left files in {output}
+    version: str | tuple[str, ...] = ()  # prints the program's version, which the result records
     renders: str = ""  # path of a test photo's render; may contain wildcards
     masks: str = ""  # path of a train photo's keep map, white = kept
     ply: str = ""  # splats, for counting and size
@@ -333,8 +341,6 @@ def load_description(path: Path) -> MethodEntry:
     Raises:
         AwError: no such file, no YAML or TOML, an unknown key or placeholder, or a missing key.
     """
-    if len(path.parts) == 1 and not path.suffix and not path.exists():
-        path = packaged(path.name)
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -415,7 +421,7 @@ def _check(program: CommandProgram, options: set[str], path: Path) -> None:
     if missing:
         raise AwError(f"{path} does not say {' and '.join(missing)}; see docs/external-methods.md")
     run = {*RUN, *options}
-    for key in COMMANDS:
+    for key in (*COMMANDS, "version"):
         for argument in program.words(key):
             check(argument, run, f"{path}, {key}")
     for name, value in program.environment.items():

@@ -241,14 +241,23 @@ def run_logged(
     return time.perf_counter() - begin
 
 
+def last_line(log: Path) -> str:
+    """Return the last line that a command of `run_logged` wrote; empty if it wrote none."""
+    return "".join(_last_lines(log)[-1:])
+
+
 def _tail(log: Path) -> str:
-    """Return "last lines of LOG: ..." as one line, without the escapes of a terminal."""
+    """Return "last lines of LOG: ..." as one line."""
+    return f"last lines of {log}: " + (" | ".join(_last_lines(log)[-_TAIL_LINES:]) or "(it wrote nothing)")
+
+
+def _last_lines(log: Path) -> list[str]:
+    """Return what the last command wrote at its end, without the escapes of a terminal."""
     with open(log, "rb") as f:
         f.seek(max(0, log.stat().st_size - _TAIL_BYTES))
         text = f.read().decode(errors="replace")
     lines = [_ESCAPES.sub("", line).strip() for line in re.split(r"[\r\n]+", text)]
-    lines = [line for line in lines if line and not line.startswith("$ ")]
-    return f"last lines of {log}: " + (" | ".join(lines[-_TAIL_LINES:]) or "(it wrote nothing)")
+    return [line for line in lines if line and not line.startswith("$ ")]
 
 
 def _end_group(group: int, process: subprocess.Popen[bytes] | None = None) -> None:

@@ -1,7 +1,7 @@
 """Methods named by their location: a recipe in a file, a program's description, NerfBaselines.
 
 recipe.py:my_recipe     a function, or a MethodEntry, in a Python file, which is loaded as a module
-external:my.yaml        a program with commands of its own, see external.py
+external:my.yaml        a program with commands of its own, see external.py; external:NAME: of the package
 nerfbaselines:METHOD    a method of NerfBaselines in its own environment, see nerfbaselines_methods.py
 masks:FOLDER            masks in files, see folder_masks.py
 """
@@ -163,9 +163,10 @@ def is_program(name: str) -> bool:
 
 
 def reference_file(name: str) -> Path | None:
-    """Return the file that a reference names; None if it names no file."""
+    """Return the file that a reference names; None if it names none, or a description of the package."""
     if name.startswith(EXTERNAL):
-        return Path(name.removeprefix(EXTERNAL))
+        path = Path(name.removeprefix(EXTERNAL))
+        return path if len(path.parts) > 1 or path.suffix or path.is_file() else None
     match = None if name.startswith((NERFBASELINES, MASKS)) else _recipe_match(name)
     return Path(match["path"]) if match else None
 
@@ -196,9 +197,9 @@ def read_reference(name: str, *, given_as: str = "") -> MethodEntry:
         AwError: no such file, or no recipe in it.
     """
     if name.startswith(EXTERNAL):
-        from ambiguous_wild.methods.external import load_description
+        from ambiguous_wild.methods.external import load_description, packaged
 
-        entry = load_description(Path(name.removeprefix(EXTERNAL)))
+        entry = load_description(reference_file(name) or packaged(name.removeprefix(EXTERNAL)))
     elif name.startswith(NERFBASELINES):
         from ambiguous_wild.methods.nerfbaselines_methods import nerfbaselines_entry
 

@@ -1,5 +1,7 @@
 """Programs that leave splats, and what a description shows them: train photos alone, or NeRF-W's folders."""
 
+import json
+import os
 import sys
 from pathlib import Path
 
@@ -14,7 +16,7 @@ from ambiguous_wild.io.colmap_model import read_model, write_views
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
-from ambiguous_wild.methods.external import PACKAGED, load_description
+from ambiguous_wild.methods.external import PACKAGED, load_description, packaged
 from ambiguous_wild.methods.external_process import stage
 from ambiguous_wild.splat.train_config import TrainConfig
 from tests.methods.baselines import parts_of, trained
@@ -124,14 +126,69 @@ def test_nerfws_folders_hold_the_split_and_full_size(scene, tmp_path):
 def test_descriptions_of_the_package_are_sound(name, tmp_path, monkeypatch):
     for variable in ("AW_HA_NERF", "AW_CR_NERF"):
         monkeypatch.setenv(variable, str(tmp_path))
-    entry = load_description(Path(name))
+    entry = load_description(packaged(name))
     assert entry.name == name and entry.summary and entry.paper and entry.needs
     monkeypatch.delenv("AW_HA_NERF")
     if name == "ha-nerf":
         with pytest.raises(AwError, match="export AW_HA_NERF=FOLDER"):
-            load_description(Path(name))
+            load_description(packaged(name))
 
 
 def test_an_unknown_description_names_those_that_there_are():
     with pytest.raises(AwError, match=r"did you mean 'opensplat'.*external:PATH\.yaml"):
-        load_description(Path("opensplatt"))
+        registry.get_method("external:opensplatt")
+
+
+# The command line of OpenSplat 1.2, and what it reads and writes.
+OPENSPLAT = """#!{python}
+import argparse, json, pathlib, shutil, sys
+if sys.argv[1:] == ["--version"]:
+    print("9.9 (git commit abc)")
+    sys.exit()
+parser = argparse.ArgumentParser(allow_abbrev=False)
+parser.add_argument("scene", type=pathlib.Path)
+parser.add_argument("-o", "--output", type=pathlib.Path)
+for option in ["-n", "--densify-from", "--refine-every", "--sh-degree-interval", {newer}]:
+    parser.add_argument(option, type=int)
+given = parser.parse_args()
+model = {{path.name for path in (given.scene / "sparse/0").iterdir()}}
+assert model >= {{"cameras.bin", "images.bin", "points3D.bin"}}
+assert sorted(path.name for path in (given.scene / "images").iterdir()) == {photos}
+shutil.copyfile({splats!r}, given.output)
+given.output.with_name("given.json").write_text(json.dumps(vars(given), default=str))
+"""
+
+
+@pytest.fixture
+def opensplat(model, tmp_path, monkeypatch):
+    """A function that puts a stand-in on PATH."""
+
+    def install(newer='"--densify-until"'):
+        program = tmp_path / "bin" / "opensplat"
+        program.parent.mkdir()
+        program.write_text(
+            OPENSPLAT.format(python=sys.executable, newer=newer, photos=sorted(TRAIN), splats=str(model[1]))
+        )
+        program.chmod(0o755)
+        monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
+
+    return install
+
+
+def test_opensplat_gets_the_train_photos_and_its_version_is_recorded(scene, opensplat, tmp_path):
+    opensplat()
+    settings = ["opensplat.densify_until=70"]
+    (cell,) = plan_cells(["external:opensplat"], [scene], [0], TrainConfig(iterations=90), settings=settings)
+    (report,) = run_cells([cell], tmp_path / "runs")
+    assert report.outcome == "trained", report.error
+    result = read_result(report.folder / "metrics.json")
+    assert result["facts"]["revision"] == "9.9 (git commit abc)" and result["facts"]["not_told"] == ["seed"]
+    given = json.loads((report.folder / "external/output/given.json").read_text())
+    assert (given["n"], given["densify_until"], given["refine_every"]) == (90, 70, 500)
+
+
+def test_an_opensplat_whose_splats_would_lie_elsewhere_is_refused(scene, opensplat, tmp_path):
+    opensplat(newer="")
+    (cell,) = plan_cells(["external:opensplat"], [scene], [0], TrainConfig(iterations=5))
+    (report,) = run_cells([cell], tmp_path / "runs")
+    assert report.outcome == "failed" and "unrecognized arguments: --densify-until=-1" in report.error

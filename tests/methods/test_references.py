@@ -8,8 +8,8 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.job import read_sources
 from ambiguous_wild.methods import registry
-from ambiguous_wild.methods.graft import graft_name
-from ambiguous_wild.methods.references import import_file
+from ambiguous_wild.methods.graft import graft_name, with_files
+from ambiguous_wild.methods.references import import_file, reference_file
 
 CODE = r'''
 from dataclasses import dataclass
@@ -196,3 +196,16 @@ def test_a_donor_may_be_a_recipe_in_a_file(recipe):
     assert (text, kind) == (f"{recipe.resolve()}:plain", "method")
     with pytest.raises(AwError, match="no plugin file"):
         registry.get_method("3dgs@mask=nowhere.py:mine")
+
+
+def test_a_description_of_the_package_is_named_alike_from_every_folder(tmp_path, monkeypatch):
+    name = "external:opensplat"
+    (tmp_path / "opensplat").mkdir()  # a folder of that name is no description
+    monkeypatch.chdir(tmp_path)
+    entry = registry.get_method(name)
+    assert entry.name == "opensplat" and entry.given_as == name and reference_file(name) is None
+    assert with_files(f"{name}+2passes", lambda path: tmp_path / path) == f"{name}+2passes"
+    ((text, path),) = [(source.text, source.path) for source in read_sources([], [name])]
+    assert (text, path) == (name, "")
+    (tmp_path / "mine").write_text("name: mine\ntrain: x\nrenders: '{stem}'\n")
+    assert registry.get_method("external:mine").given_as == f"external:{tmp_path / 'mine'}"

@@ -92,11 +92,11 @@ def started(scene, tmp_path, monkeypatch):
 
 
 def test_density_control_takes_what_became_transparent(started):
-    without, near_space = started("without", ()), started("near")
+    without, kept_empty = started("without", ()), started("near")
     train(without)
-    train(near_space)
-    assert near_space.effects.facts()["near"]["cameras"] > 0
-    assert len(near_space.gaussians.means) < len(without.gaussians.means)
+    train(kept_empty)
+    assert kept_empty.effects.facts()["near"]["cameras"] > 0
+    assert len(kept_empty.gaussians.means) < len(without.gaussians.means)
 
 
 def scene_with(place, photos, wall_photos=3) -> SimpleNamespace:

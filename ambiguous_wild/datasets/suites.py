@@ -61,7 +61,7 @@ def suites() -> dict[str, Suite]:
     """Read all suites, by name."""
     rows: dict[str, dict[str, Any]] = {}
     for row in read_mapping(FILE)["suites"]:
-        rows[row["name"]] = {**rows.get(row.pop("like", ""), {}), **row}
+        rows[row["name"]] = {**(rows[row.pop("like")] if "like" in row else {}), **row}
     return {name: _suite(row) for name, row in rows.items()}
 
 

@@ -163,8 +163,9 @@ class CommandProgram:
             state = task.work / DONE
             done: dict[str, float] = _read(state)
             output = self._output(task)
-            revision = self._revision(values, task)
             if "train_s" not in done:
+                if self.keys.version:  # of the program that trains, whatever renders later
+                    self._command("version", "version", values, task)
                 resuming = self._may_resume(task, output)
                 if not resuming:
                     shutil.rmtree(output, ignore_errors=True)
@@ -177,7 +178,7 @@ class CommandProgram:
             if self.keys.render and "render_s" not in done:
                 done["render_s"] = self._command("render", "render", values, task)
                 write_json(state, done)
-            return self._collect(task, values, done, revision)
+            return self._collect(task, values, done)
         finally:
             shutil.rmtree(staged, ignore_errors=True)
 
@@ -229,16 +230,13 @@ class CommandProgram:
             timeout_s=self.keys.timeout_h * 3600.0 or None,
         )
 
-    def _revision(self, values: dict[str, object], task: Task) -> str | None:
+    def _revision(self, task: Task) -> str | None:
         """Return what the program calls its version; else the commit of `cwd`, unless that is our own."""
-        if not self.keys.version:
-            return git_commit(self.cwd) if self.cwd != PACKAGED.resolve() else None
-        self._command("version", "version", values, task)
-        return last_line(task.logs / "version.log")
+        if self.keys.version:
+            return last_line(task.logs / "version.log") or None
+        return git_commit(self.cwd) if self.cwd != PACKAGED.resolve() else None
 
-    def _collect(
-        self, task: Task, values: dict[str, object], done: dict[str, float], revision: str | None
-    ) -> Produced:
+    def _collect(self, task: Task, values: dict[str, object], done: dict[str, float]) -> Produced:
         tests, trains = task.scene.test, task.scene.train
         drawn = [] if self.drawn_by_us else list(enumerate(tests))
         renders = {view.name: self._find(self.keys.renders, values, view, i) for i, view in drawn}
@@ -269,7 +267,10 @@ class CommandProgram:
             drawn_by_us=self.drawn_by_us,
             cost=cost,
             # the settings of the run that the commands do not pass
-            facts={"revision": revision, "not_told": sorted({"seed", "iterations"} - self._used())},
+            facts={
+                "revision": self._revision(task),
+                "not_told": sorted({"seed", "iterations"} - self._used()),
+            },
         )
 
     def _pattern(self, template: str, values: dict[str, object], view: View, index: int) -> str:

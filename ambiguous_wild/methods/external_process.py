@@ -257,7 +257,8 @@ def _last_lines(log: Path) -> list[str]:
         f.seek(max(0, log.stat().st_size - _TAIL_BYTES))
         text = f.read().decode(errors="replace")
     lines = [_ESCAPES.sub("", line).strip() for line in re.split(r"[\r\n]+", text)]
-    return [line for line in lines if line and not line.startswith("$ ")]
+    begun = max((k for k, line in enumerate(lines) if line.startswith("$ ")), default=-1)
+    return [line for line in lines[begun + 1 :] if line]
 
 
 def _end_group(group: int, process: subprocess.Popen[bytes] | None = None) -> None:

@@ -166,7 +166,9 @@ def reference_file(name: str) -> Path | None:
     """Return the file that a reference names; None if it names none, or a description of the package."""
     if name.startswith(EXTERNAL):
         path = Path(name.removeprefix(EXTERNAL))
-        return path if len(path.parts) > 1 or path.suffix or path.is_file() else None
+        # a program that lies here may be called like a description of the package: ./NAME is a file
+        ours = (Path(__file__).parent / "descriptions" / f"{path}.yaml").is_file()
+        return path if "/" in name or path.suffix or (path.is_file() and not ours) else None
     match = None if name.startswith((NERFBASELINES, MASKS)) else _recipe_match(name)
     return Path(match["path"]) if match else None
 

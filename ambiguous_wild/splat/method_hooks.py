@@ -6,6 +6,7 @@ called and allocates nothing.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -21,7 +22,7 @@ from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.io.mask_reasons import MaskReasons
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.effects.near_space import contradicted_points
+from ambiguous_wild.splat.effects.near_space import free_space_violations
 from ambiguous_wild.splat.fields import Fields
 from ambiguous_wild.splat.gaussians import MIN_POINTS, Gaussians
 from ambiguous_wild.splat.render import BLUR
@@ -35,6 +36,7 @@ START_SHARE = 2 / 3
 
 # (data, how many at most) -> xyz [M, 3] and rgb [M, 3] uint8
 MorePoints = Callable[[TrainData, int], tuple[np.ndarray, np.ndarray]]
+LOG = logging.getLogger(__name__)
 
 
 class RenderLeaves:
@@ -220,7 +222,7 @@ class MethodHooks:
     # what the user gives to start from: Gaussians, or points [M, 3] with colours [M, 3] uint8
     given: Gaussians | tuple[np.ndarray, np.ndarray] | None = None
     # the first Gaussians; None = one at every point of the sparse model (without those of
-    # `contradicted_points`) and of `more_points`
+    # `free_space_violations`) and of `more_points`
     start: Callable[[TrainData], Gaussians] | None = None
     more_points: tuple[MorePoints, ...] = ()  # further points to start from; each fills the room that is left
     blur: float = BLUR  # px^2 added to both variances of a splat
@@ -253,8 +255,9 @@ class MethodHooks:
         if self.start is not None and self.given is None:
             return self.start(data)
         if self.given is None:
-            sparse, stay = data.scene.points, ~contradicted_points(data.scene)
-            xyz, rgb = sparse.xyz[stay], sparse.rgb[stay]
+            sparse, out = data.scene.points, free_space_violations(data.scene, data.user_keep)
+            xyz, rgb = sparse.xyz[~out], sparse.rgb[~out]
+            LOG.debug("%d of %d sparse points left out: in the free space of photos", out.sum(), len(out))
         else:
             xyz, rgb = self.given
         kept = thinned(len(xyz), most)

@@ -200,7 +200,7 @@ def test_a_donor_may_be_a_recipe_in_a_file(recipe):
 
 def test_a_description_of_the_package_is_named_alike_from_every_folder(tmp_path, monkeypatch):
     name = "external:opensplat"
-    (tmp_path / "opensplat").mkdir()  # a folder of that name is no description
+    (tmp_path / "opensplat").write_text("a program")  # no description, though it is called so
     monkeypatch.chdir(tmp_path)
     entry = registry.get_method(name)
     assert entry.name == "opensplat" and entry.given_as == name and reference_file(name) is None

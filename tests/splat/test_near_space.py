@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.scene import SparsePoints
 from ambiguous_wild.splat.effects import near_space, with_effects
-from ambiguous_wild.splat.effects.near_space import EVERY, NearSpace, contradicted_points
+from ambiguous_wild.splat.effects.near_space import EVERY, NearSpace, free_space_violations
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.training_loop import train
@@ -140,20 +140,29 @@ def scene_with(place, photos, wall_photos=3) -> SimpleNamespace:
         ((1.0, 0.0, -1.0), (0, 1), False),  # behind the cameras
     ],
 )
-def test_training_does_not_start_from_contradicted_points(place, photos, left_out):
+def test_training_does_not_start_from_points_in_free_space(place, photos, left_out):
     scene = scene_with(place, photos, wall_photos=4)
-    assert contradicted_points(scene).tolist() == [left_out] + [False] * 40
-    start = MethodHooks().first_gaussians(SimpleNamespace(scene=scene, device="cpu"))
+    assert free_space_violations(scene, [None] * 4).tolist() == [left_out] + [False] * 40
+    start = MethodHooks().first_gaussians(SimpleNamespace(scene=scene, device="cpu", user_keep=[None] * 4))
     np.testing.assert_array_equal(start.means, scene.points.xyz[left_out:].astype(np.float32))
 
 
-def test_photos_without_sure_points_contradict_nothing():
-    assert not contradicted_points(scene_with((1.0, 0.0, 5.9), (0, 1), wall_photos=2)).any()
+def test_a_photo_that_masks_the_place_says_nothing_of_it():
+    scene = scene_with((1.0, 0.0, 5.9), (0, 1), wall_photos=4)
+    keep = torch.ones(80, 100)
+    keep[:, :50] = 0.0  # photos 2 and 3 have the point left of their middle
+    assert free_space_violations(scene, [None, None, 1.0 - keep, None])[0]
+    assert not free_space_violations(scene, [None, None, keep, None]).any()
+
+
+def test_photos_without_long_tracks_have_no_free_space():
+    scene = scene_with((1.0, 0.0, 5.9), (0, 1), wall_photos=2)
+    assert not free_space_violations(scene, [None] * 4).any()
     scan = SimpleNamespace(points=SparsePoints.without_tracks(np.ones((5, 3))), views=[], train=[])
-    assert not contradicted_points(scan).any()
+    assert not free_space_violations(scan, []).any()
 
 
 def test_points_of_the_user_are_all_started_from():
     scene = scene_with((1.0, 0.0, 5.9), (0, 1), wall_photos=4)
     hooks = MethodHooks(given=(scene.points.xyz, scene.points.rgb))
-    assert len(hooks.first_gaussians(SimpleNamespace(scene=scene, device="cpu"))) == 41
+    assert len(hooks.first_gaussians(SimpleNamespace(scene=scene, device="cpu", user_keep=[None] * 4))) == 41

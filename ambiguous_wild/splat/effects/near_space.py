@@ -2,7 +2,8 @@
 
 Floaters there explain one photo, and no other photo corrects them. With the effect `near`, what lies in a
 camera's picture nearer than a share of the depth of its nearest SfM points becomes transparent, and density
-control, while it works, removes it. Every run leaves out start points there that other photos contradict.
+control, while it works, removes it. Every run leaves out start points that violate the free space of other
+photos.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ SHARE = 0.6  # share of the depth of the nearest points below which nothing belo
 NEAREST = 0.02  # quantile of depths that counts as that depth
 FEW_POINTS = 20  # cameras with fewer points are ignored
 EVERY = 50  # iterations
-SURE = 3  # train photos that must see a point, so that each is checked by two others
-CONTRADICTIONS = 2  # photos that must contradict a point; one may have missed it
+MIN_TRACK = 3  # train photos that must see a point, so that each is checked by two others
+VIOLATED = 2  # photos whose free space a point must violate; one may have missed it
 GONE = -9.0  # logit of opacity, so low that density control removes the Gaussian before Adam can raise it
 
 
@@ -73,27 +74,36 @@ def nearest_depths(cameras: Sequence[Camera], xyz: np.ndarray, seen: Sequence[np
     return depths
 
 
-def contradicted_points(scene: Scene) -> np.ndarray:
-    """Return the SfM points [M] bool that no third train photo confirms and that other photos contradict.
+def free_space_violations(scene: Scene, keeps: Sequence[Tensor | None]) -> np.ndarray:
+    """Return the SfM points [M] bool that lie in space which other photos show to be free.
 
-    A photo contradicts a point that it should show, and does not, nearer than what it surely shows: than
-    `SHARE` of the depth of its nearest points of at least `SURE` train photos. Such points are distractors
-    that passed close to the cameras, and wrong matches. Where masks hide them, the loss corrects nothing,
-    and they veil a test view between the train photos.
+    A point of fewer than `MIN_TRACK` train photos is in free space for another photo if it lies in its frame,
+    not under its keep mask, nearer than `SHARE` of the depth of the nearest points of longer tracks that this
+    photo sees. `VIOLATED` such photos are needed. Such points are distractors that passed close to the
+    cameras, and wrong matches. Where masks hide them, the loss corrects nothing, and they are floaters in a
+    test view between the train photos.
+
+    Args:
+        scene: scene with tracks.
+        keeps: keep map [H, W] of each train photo, or None.
     """
     xyz, seen = scene.points.xyz, tracks_of(scene)
-    photos = np.bincount(np.concatenate([np.zeros(0, np.int64), *seen]), minlength=len(xyz))
-    sure = photos >= SURE
+    length = np.bincount(np.concatenate([np.zeros(0, np.int64), *seen]), minlength=len(xyz))
+    tracked = length >= MIN_TRACK
     cameras = [view.camera for view in scene.train]
-    contradictions = np.zeros(len(xyz), np.int64)
-    depths = nearest_depths(cameras, xyz, [rows[sure[rows]] for rows in seen])
-    for camera, own, depth in zip(cameras, seen, depths, strict=True):
-        asked = ~sure
-        asked[own] = False
-        rows = np.flatnonzero(asked)
+    violated = np.zeros(len(xyz), np.int64)
+    depths = nearest_depths(cameras, xyz, [rows[tracked[rows]] for rows in seen])
+    for camera, own, depth, keep in zip(cameras, seen, depths, keeps, strict=True):
+        others = ~tracked
+        others[own] = False
+        rows = np.flatnonzero(others)
         local = camera.to_camera(xyz[rows])
         near = (local[:, 2] > 0) & (local[:, 2] < depth)
         (x, y, z), rows = local[near].T, rows[near]
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        contradictions[rows] += (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-    return contradictions >= CONTRADICTIONS
+        inside_frame = (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+        if keep is not None:  # the photo's features there were not matched
+            row, column = v.clip(0, camera.height - 1).astype(int), u.clip(0, camera.width - 1).astype(int)
+            inside_frame &= keep.cpu().numpy()[row, column] > 0.5
+        violated[rows] += inside_frame
+    return violated >= VIOLATED

@@ -26,8 +26,10 @@ def tracks_of(scene: Scene) -> list[np.ndarray]:
     """Return for each train photo the sorted indices of its sparse points."""
     points = scene.points
     owner = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
+    order = np.argsort(points.track_views, kind="stable")
     train = [index for index, view in enumerate(scene.views) if view.split == "train"]
-    return [np.unique(owner[points.track_views == index]) for index in train]
+    first = np.searchsorted(points.track_views[order], [train, np.add(train, 1)]).reshape(2, -1)
+    return [np.unique(owner[order[begin:end]]) for begin, end in first.T]
 
 
 def track_colours(scene: Scene, photos: Iterable[np.ndarray]) -> TrackColours:

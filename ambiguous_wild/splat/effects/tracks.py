@@ -27,9 +27,9 @@ def tracks_of(scene: Scene) -> list[np.ndarray]:
     points = scene.points
     owner = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
     order = np.argsort(points.track_views, kind="stable")
-    train = [index for index, view in enumerate(scene.views) if view.split == "train"]
-    first = np.searchsorted(points.track_views[order], [train, np.add(train, 1)]).reshape(2, -1)
-    return [np.unique(owner[order[begin:end]]) for begin, end in first.T]
+    train = np.array([k for k, view in enumerate(scene.views) if view.split == "train"], np.int64)
+    begins, ends = np.searchsorted(points.track_views[order], np.stack([train, train + 1]))
+    return [np.unique(owner[order[begin:end]]) for begin, end in zip(begins, ends, strict=True)]
 
 
 def track_colours(scene: Scene, photos: Iterable[np.ndarray]) -> TrackColours:

@@ -3,9 +3,12 @@
     python benchmarks/publish.py --work DIR [--data DIR] [--seeds 0 1 2] [--methods ...] [--iterations 1000]
         [--jobs 2] [--only NAME...] [--set METHOD.OPTION=VALUE...]
 
-Captures: the suite aw-sim, and distractors pasted on the photos of --data before structure from motion
-(`aw composite`). --data holds a folder of photos for each base, and cutouts/; without it no composites are
-made. --methods all: every method of `aw methods`. All methods of a scene train with the effects of its plan.
+Captures: the suite aw-sim; distractors pasted on the photos of --data before structure from motion (`aw
+composite`); and photos of --data in which something moves, with polygons that a person drew around it
+(movers.json, px of the file): in train photos for the scores of masks, in test photos so that PSNR leaves it
+out (`psnr_valid`). --data holds a folder of photos for each, and cutouts/; without it only the
+suite is made. --methods all: every method of `aw methods`. All methods of a scene train with the effects of
+its plan.
 Checked runs go to the board, leaderboard/measured; then `python benchmarks/figures.py` writes the tables.
 """
 
@@ -13,18 +16,25 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
+import cv2
+import numpy as np
 from job_queue import Run, aw, count, exit_code, run_all, seed
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.suites import MEASURED as FACTS
 from ambiguous_wild.datasets.suites import get_suite
-from ambiguous_wild.io.files import write_text
+from ambiguous_wild.io.files import atomic_dir, write_text
+from ambiguous_wild.io.images import read_gray, write_png
+from ambiguous_wild.io.photos import read_photo
 from ambiguous_wild.io.plain_yaml import read_mapping
+from ambiguous_wild.io.scene_folder import read_list
 from ambiguous_wild.methods.registry import all_methods
 from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
 from ambiguous_wild.report.ambiguity_summary import semantic_metric
@@ -34,17 +44,22 @@ ROOT = Path(__file__).parents[1]
 SUITE = get_suite("aw-sim")
 BASES = {"seneca": 4, "monstree": 4, "sceaux": 4, "tiny_aerial": 2}  # downsampling to 240 px and more
 KINDS = ("cutouts", "patches")
+MOVERS = ROOT / "benchmarks" / "movers.json"  # capture: photo: polygons [[x, y], ...]
+DRAWN = {"train": 2, "statue": 2, "reichstag": 4}  # captures of MOVERS: downsampling
 METHODS = ("3dgs", "dronesplat", "robustsplat", "refinesplat", "3dgs+truth")
 WORLD = 5  # seed of pasted distractors; nothing was tuned on it
+# Options of methods that would take whatever pretrained networks lie on this machine; --set replaces them.
+HAND_MADE = {"robustsplat": ("features=labhog",), "refinesplat-paper": ("features=labhog", "instances=graph")}
 
 
 @dataclass(frozen=True)
 class Capture:
-    """How the photos of a composite are made."""
+    """How the photos of a capture are made, and built into a scene."""
 
     name: str
     factor: int
-    words: tuple[str, ...]  # of `aw`, all but the output
+    dataset: str  # on the board
+    make: Callable[[Path], None]  # writes the raw folder
 
     def build(self, work: Path) -> Path:
         """The scene folder; it is built if it is not there."""
@@ -52,18 +67,45 @@ class Capture:
         if not (scene / "scene.json").is_file():
             print(f"making {self.name}", flush=True)
             if not raw.is_dir():
-                aw(*self.words, "-o", str(raw))
+                self.make(raw)
             aw("build-scene", str(raw), "-o", str(scene), "--factor", str(self.factor))
+        if self.name in DRAWN:
+            leave_out_polygons(scene)
         return scene
 
 
-def composites(data: Path | None) -> Iterator[Capture]:
-    """All composites; there are none without a folder of photos."""
-    for base, factor in BASES.items() if data is not None else ():
+def real_captures(data: Path) -> Iterator[Capture]:
+    """Composites, and captures in which something moves."""
+    for base, factor in BASES.items():
         for kind in KINDS:
             words = ("composite", str(data / base), "--seed", str(WORLD))
             words += ("--cutouts", str(data / "cutouts")) if kind == "cutouts" else ("--patches",)
-            yield Capture(f"{base}-{kind}", factor, words)
+            yield Capture(
+                f"{base}-{kind}", factor, "composites", lambda raw, words=words: aw(*words, "-o", str(raw))
+            )
+    for name, factor in DRAWN.items():
+        yield Capture(name, factor, "movers", partial(copy_with_polygons, data / name, name))
+
+
+def copy_with_polygons(photos: Path, name: str, raw: Path) -> None:
+    """Copy photos, with what is inside of polygons as truth."""
+    polygons = json.loads(MOVERS.read_text(encoding="utf-8"))[name]
+    with atomic_dir(raw) as folder:
+        for path in sorted((photos / "images").iterdir()):
+            shutil.copy(path, folder)
+            if path.stem in polygons:
+                drawn = np.zeros(read_photo(path)[1].shape[:2], np.uint8)
+                cv2.fillPoly(drawn, [np.array(p, np.int32) for p in polygons[path.stem]], 255)
+                write_png(folder / "truth" / "distractor" / f"{path.stem}.png", drawn)
+
+
+def leave_out_polygons(scene: Path) -> None:
+    """Make masks of the truth of test photos: which photos test is known once the scene is built."""
+    for name in read_list(scene / "test_list.txt"):
+        mask = f"{Path(name).stem}.png"
+        drawn = scene / "truth" / "distractor" / mask
+        if drawn.is_file():
+            write_png(scene / "masks" / "test" / mask, 255 - read_gray(drawn))
 
 
 def suite_scenes(names: Sequence[str], work: Path) -> dict[str, Path]:
@@ -100,6 +142,8 @@ def runs_of(scene: Path, args: argparse.Namespace) -> Iterator[Run]:
         for method in args.methods:
             folder = args.runs / scene.name / method / f"seed{number}"
             own = tuple(option for owner, option in options if owner == method)
+            given = {option.partition("=")[0] for option in own}
+            own += tuple(o for o in HAND_MADE.get(method, ()) if o.partition("=")[0] not in given)
             yield Run(f"{method} on {scene.name}, seed {number}", folder, method, words, own)
 
 
@@ -118,8 +162,8 @@ def main(words: Sequence[str] | None = None) -> int:
     if args.methods == ["all"]:
         args.methods = [*all_methods()]
     args.runs = args.work / "-".join(["runs", *args.set])  # runs with other options have their own folder
-    pasted = {capture.name: capture for capture in composites(args.data)}
-    known = [*SUITE.scenes, *pasted]
+    real = {capture.name: capture for capture in real_captures(args.data)} if args.data else {}
+    known = [*SUITE.scenes, *real]
     if unknown := set(args.only or ()) - {*known}:
         raise AwError(f"--only {min(unknown)}: no such capture; there are {', '.join(known)}")
     chosen = args.only or known
@@ -127,11 +171,11 @@ def main(words: Sequence[str] | None = None) -> int:
         raise AwError(f"--set {min(idle)}: --methods does not have it")
     scenes = suite_scenes([name for name in chosen if name in SUITE.scenes], args.work)
     record_ambiguity(scenes, args.work)
-    scenes |= {name: pasted[name].build(args.work) for name in chosen if name in pasted}
+    scenes |= {name: real[name].build(args.work) for name in chosen if name in real}
     failed = run_all([run for scene in scenes.values() for run in runs_of(scene, args)], args.jobs)
     for name in scenes:
-        # the photos of the bases may not be passed on
-        dataset, images = ("composites", "0") if name in pasted else (SUITE.dataset, "1")
+        # photos of --data may not be passed on
+        dataset, images = (real[name].dataset, "0") if name in real else (SUITE.dataset, "1")
         add = ("leaderboard", "add", str(args.runs / name), "--board", str(args.board))
         print(aw(*add, "--dataset", dataset, "--images", images, "--overwrite"), end="", flush=True)
     for line in failed:

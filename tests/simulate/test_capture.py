@@ -169,7 +169,7 @@ def test_test_viewpoints_are_new_and_inside_the_walk() -> None:
 
 
 def test_no_distractor_keeps_its_place_and_none_stands_in_the_scenery() -> None:
-    twin = preset("courtyard-twin").distractors[:1]
+    twin = tuple(d for d in preset("tiny").distractors if d.kind == "twin")
     spec = replace(resized(preset("tiny"), views=14, width=96), detail_px_per_m=COARSE, distractors=twin)
     world, shots = capture_writer.plan(spec, 1)
     spots = np.array([(p.x_m, p.y_m) for s in shots for p in s.placements])
@@ -228,8 +228,8 @@ def test_textures_are_finite_and_never_flat_at_any_resolution(detail: float) -> 
 
 
 def test_a_preset_is_found_by_name_and_resized_within_limits() -> None:
-    with pytest.raises(AwError, match="did you mean 'courtyard-twin'"):
-        preset("courtyard-twins")
+    with pytest.raises(AwError, match="did you mean 'courtyard-plain'"):
+        preset("courtyard-plains")
     for words, message in (({"views": 2}, "--views 2"), ({"width": 10}, "--width 10")):
         with pytest.raises(AwError, match=message):
             resized(preset("tiny"), **words)

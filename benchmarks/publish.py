@@ -4,9 +4,9 @@
         [--jobs 2] [--only NAME...] [--set METHOD.OPTION=VALUE...]
 
 Captures: the suite aw-sim; distractors pasted on the photos of --data before structure from motion (`aw
-composite`); and photos of --data in which something moves, with polygons that a person drew around it
-(movers.json, px of the file): in train photos for the scores of masks, in test photos so that PSNR leaves it
-out (`psnr_valid`). --data holds a folder of photos for each, and cutouts/; without it only the
+composite`); and, if --only names them, photos of --data in which something moves, with polygons that a person
+drew around it (movers.json, px of the file): in train photos for the scores of masks, in test photos so that
+PSNR leaves it out (`psnr_valid`). --data holds a folder of photos for each, and cutouts/; without it only the
 suite is made. --methods all: every method of `aw methods`. All methods of a scene train with the effects of
 its plan.
 Checked runs go to the board, leaderboard/measured; then `python benchmarks/figures.py` writes the tables.
@@ -166,7 +166,8 @@ def main(words: Sequence[str] | None = None) -> int:
     known = [*SUITE.scenes, *real]
     if unknown := set(args.only or ()) - {*known}:
         raise AwError(f"--only {min(unknown)}: no such capture; there are {', '.join(known)}")
-    chosen = args.only or known
+    # 3dgs+truth, a default, asks for masks of all train photos
+    chosen = args.only or [name for name in known if name not in DRAWN]
     if idle := {option.partition(".")[0] for option in args.set} - {*args.methods}:
         raise AwError(f"--set {min(idle)}: --methods does not have it")
     scenes = suite_scenes([name for name in chosen if name in SUITE.scenes], args.work)

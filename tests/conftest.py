@@ -28,6 +28,14 @@ def machine_weights(monkeypatch):
     monkeypatch.setenv("AW_WEIGHTS", os.environ["AW_TEST_WEIGHTS"])
 
 
+@pytest.fixture(autouse=True)
+def registered_methods(monkeypatch):
+    """Methods that a test registers are gone after it."""
+    from ambiguous_wild.methods import registry
+
+    monkeypatch.setattr(registry, "registered", dict(registry.registered))
+
+
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory):
     """The folder of a tiny scene that is trained on within seconds; nobody changes it."""

@@ -99,13 +99,19 @@ def test_density_control_takes_what_became_transparent(started):
     assert len(kept_empty.gaussians.means) < len(without.gaussians.means)
 
 
-def scene_with(place, photos, wall_photos=3) -> SimpleNamespace:
-    """Four train cameras 1 apart that look along z at 40 points 10 away; one more point, and a test photo.
+def a_wall() -> np.ndarray:
+    """8 x 5 points from (-1, -2) to (4, 2), 10 away."""
+    return np.array([(x, y, 10.0) for y in np.linspace(-2, 2, 5) for x in np.linspace(-1, 4, 8)])
+
+
+def scene_with(place, photos, wall_photos=4, wall=None) -> SimpleNamespace:
+    """Four train cameras 1 apart that look along z at a wall of 40 points; one more point, and a test photo.
 
     Args:
         place: position of that point.
         photos: indices of the photos that see it; 4 is the test photo.
         wall_photos: train photos that see each of the 40.
+        wall: the 40 points; those of `a_wall` if None.
     """
     views = []
     for k in range(5):
@@ -113,9 +119,7 @@ def scene_with(place, photos, wall_photos=3) -> SimpleNamespace:
         pose[0, 3] = -float(k)
         camera = Camera(100, 80, 100.0, 100.0, 50.0, 40.0, pose)
         views.append(SimpleNamespace(name=f"{k}", camera=camera, split="train" if k < 4 else "test"))
-    rng = np.random.default_rng(0)
-    wall = np.column_stack([rng.uniform(-1, 1, (40, 2)), np.full(40, 10.0)])
-    xyz = np.concatenate([[place], wall])
+    xyz = np.concatenate([[place], a_wall() if wall is None else wall])
     tracks = [np.array(photos, np.int32), *[np.arange(wall_photos, dtype=np.int32)] * 40]
     offsets = np.cumsum([0, *map(len, tracks)])
     points = SparsePoints(
@@ -133,22 +137,36 @@ def scene_with(place, photos, wall_photos=3) -> SimpleNamespace:
         ((1.0, 0.0, 5.9), (0, 1, 4), True),  # a test photo confirms nothing
         ((1.0, 0.0, 5.9), (0, 0, 0), True),  # one photo, however often
         ((1.0, 0.0, 6.1), (0, 1), False),  # six tenths of 10
-        ((-1.9, 0.0, 5.9), (2, 3), True),  # at the border of photo 1
-        ((-2.0, 0.0, 5.9), (2, 3), False),  # only photo 0 has it in its picture
-        ((1.0, 2.3, 5.9), (0, 1), True),
-        ((1.0, 2.4, 5.9), (0, 1), False),
+        ((0.65, 0.0, 5.9), (0, 1), True),  # photo 3 has it at 10.2 px, and the wall from 10 px on
+        ((0.63, 0.0, 5.9), (0, 1), False),  # only photo 2 has it before the wall
+        ((1.0, 1.1, 5.9), (0, 1), True),
+        ((1.0, 1.2, 5.9), (0, 1), False),  # below the wall, where nothing speaks against ground
         ((1.0, 0.0, -1.0), (0, 1), False),  # behind the cameras
     ],
 )
 def test_training_does_not_start_from_points_in_free_space(place, photos, left_out):
-    scene = scene_with(place, photos, wall_photos=4)
+    scene = scene_with(place, photos)
     assert free_space_violations(scene, [None] * 4).tolist() == [left_out] + [False] * 40
     start = MethodHooks().first_gaussians(SimpleNamespace(scene=scene, device="cpu", user_keep=[None] * 4))
     np.testing.assert_array_equal(start.means, scene.points.xyz[left_out:].astype(np.float32))
 
 
+def test_a_point_beside_a_near_one_may_be_right():
+    wall = a_wall()
+    place = (wall[19] - [2.5, 0.0, 0.0]) * 0.5 + [2.5, 0.0, 0.0]
+    assert free_space_violations(scene_with(place, (0, 1)), [None] * 4)[0]
+    wall[19, 2] = 8.0  # 0.6 of it is nearer than the point, which stands beside it in both photos
+    assert not free_space_violations(scene_with(place, (0, 1), wall=wall), [None] * 4).any()
+
+
+def test_points_in_a_line_enclose_nothing():
+    wall = a_wall()
+    wall[:, 1] = 0.0
+    assert not free_space_violations(scene_with((1.0, 0.0, 5.9), (0, 1), wall=wall), [None] * 4).any()
+
+
 def test_a_photo_that_masks_the_place_says_nothing_of_it():
-    scene = scene_with((1.0, 0.0, 5.9), (0, 1), wall_photos=4)
+    scene = scene_with((1.0, 0.0, 5.9), (0, 1))
     keep = torch.ones(80, 100)
     keep[:, :50] = 0.0  # photos 2 and 3 have the point left of their middle
     assert free_space_violations(scene, [None, None, 1.0 - keep, None])[0]
@@ -163,6 +181,6 @@ def test_photos_without_long_tracks_have_no_free_space():
 
 
 def test_points_of_the_user_are_all_started_from():
-    scene = scene_with((1.0, 0.0, 5.9), (0, 1), wall_photos=4)
+    scene = scene_with((1.0, 0.0, 5.9), (0, 1))
     hooks = MethodHooks(given=(scene.points.xyz, scene.points.rgb))
     assert len(hooks.first_gaussians(SimpleNamespace(scene=scene, device="cpu", user_keep=[None] * 4))) == 41

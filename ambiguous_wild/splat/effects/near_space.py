@@ -77,11 +77,12 @@ def nearest_depths(cameras: Sequence[Camera], xyz: np.ndarray, seen: Sequence[np
 def free_space_violations(scene: Scene, keeps: Sequence[Tensor | None]) -> np.ndarray:
     """Return the SfM points [M] bool that lie in space which other photos show to be free.
 
-    A point of fewer than `MIN_TRACK` train photos is in free space for another photo if it lies in its frame,
-    not under its keep mask, nearer than `SHARE` of the depth of the nearest points of longer tracks that this
-    photo sees. `VIOLATED` such photos are needed. Such points are distractors that passed close to the
-    cameras, and wrong matches. Where masks hide them, the loss corrects nothing, and they are floaters in a
-    test view between the train photos.
+    Points of fewer than `MIN_TRACK` train photos are judged by those of more. Such a point is in free space
+    for a photo that does not see it if it lies there nearer than `SHARE` of the depth of the nearest of them,
+    and within a triangle of deeper ones (Delaunay): ground at the lower border has none below it. `VIOLATED`
+    such photos are needed. Such points are distractors that passed close to the cameras, and wrong matches.
+    Where masks hide them, the loss corrects nothing, and they are floaters in a test view between the train
+    photos.
 
     Args:
         scene: scene with tracks.
@@ -92,18 +93,41 @@ def free_space_violations(scene: Scene, keeps: Sequence[Tensor | None]) -> np.nd
     tracked = length >= MIN_TRACK
     cameras = [view.camera for view in scene.train]
     violated = np.zeros(len(xyz), np.int64)
-    depths = nearest_depths(cameras, xyz, [rows[tracked[rows]] for rows in seen])
-    for camera, own, depth, keep in zip(cameras, seen, depths, keeps, strict=True):
+    judges = [rows[tracked[rows]] for rows in seen]
+    for camera, own, judge, depth, keep in zip(
+        cameras, seen, judges, nearest_depths(cameras, xyz, judges), keeps, strict=True
+    ):
         others = ~tracked
         others[own] = False
         rows = np.flatnonzero(others)
-        local = camera.to_camera(xyz[rows])
-        near = (local[:, 2] > 0) & (local[:, 2] < depth)
-        (x, y, z), rows = local[near].T, rows[near]
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        inside_frame = (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+        z = camera.to_camera(xyz[rows])[:, 2]
+        rows = rows[(z > 0) & (z < depth)]
+        if not len(rows):
+            continue
+        pixels, z = pixels_of(xyz[rows], camera)
+        free = z < SHARE * depth_around(pixels, xyz[judge], camera)
         if keep is not None:  # the photo's features there were not matched
-            row, column = v.clip(0, camera.height - 1).astype(int), u.clip(0, camera.width - 1).astype(int)
-            inside_frame &= keep.cpu().numpy()[row, column] > 0.5
-        violated[rows] += inside_frame
+            column, row = pixels.clip(0, (camera.width - 1, camera.height - 1)).astype(int).T
+            free &= keep.cpu().numpy()[row, column] > 0.5
+        violated[rows] += free
     return violated >= VIOLATED
+
+
+def pixels_of(xyz: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels [N, 2] and depths [N] of points [N, 3] in front of a camera, in float64."""
+    local = camera.to_camera(xyz)
+    z = local[:, 2]
+    return local[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy), z
+
+
+def depth_around(pixels: np.ndarray, xyz: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the least depth of the triangle of points [M, 3] around each pixel, [N]; 0 outside of all."""
+    from scipy.spatial import Delaunay, QhullError
+
+    corners, z = pixels_of(xyz[camera.to_camera(xyz)[:, 2] > 0], camera)
+    try:
+        mesh = Delaunay(corners)
+    except QhullError:  # all in a line
+        return np.zeros(len(pixels))
+    triangle = mesh.find_simplex(pixels)
+    return np.where(triangle < 0, 0.0, z[mesh.simplices[triangle]].min(axis=1))

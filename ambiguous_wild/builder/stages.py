@@ -338,6 +338,8 @@ class Stages:
              earlier and earlier.matches.key, left_out, settings.seed],
             lambda f: sfm.match(f, features.folder, earlier.matches.folder if earlier else None, left_out),
         )  # fmt: skip
+        if earlier and matches.facts["verified"] == earlier.matches.facts["verified"]:
+            return earlier  # no new pair, so no other photo can be placed
         mapping = work.run(
             "mapping",
             [matches.key, settings.mapper, settings.part, to_plain(plan), settings.seed,

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ambiguous_wild.builder import stages
@@ -18,6 +19,8 @@ from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
 from ambiguous_wild.builder.sfm import StructureFromMotion
 from ambiguous_wild.builder.stages import SfmStages, Stages
 from ambiguous_wild.core import AwError
+from ambiguous_wild.io.images import write_png
+from ambiguous_wild.io.photos import read_photo
 from tests.builder.capture_maker import write_capture
 
 
@@ -148,3 +151,16 @@ def test_photos_that_are_left_out_look_for_more_partners(monkeypatch, tmp_path):
     info = build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(factor=2), jobs=2).info
     assert info["counts"]["registered"] == 8 and info["chosen"]["sfm"] == "wider"
     assert 8 <= info["counts"]["pairs"] <= 28
+
+
+def test_photos_are_not_placed_again_from_the_same_pairs(monkeypatch, tmp_path):
+    """A photo of noise has no partner, however many photos it is compared with."""
+    height, width, _ = read_photo(write_capture(tmp_path / "raw", 8)[0])[1].shape
+    write_png(tmp_path / "raw/q.png", np.random.default_rng(0).integers(0, 255, (height, width, 3), np.uint8))
+    fast = SfmPlan("fast", "opencv", 3000, 0.8, "retrieval", 7, 0, 2.0, 1, 0.0, 1, 4)
+    wider = dataclasses.replace(fast, name="wider", similar=8, continues=True)
+    monkeypatch.setattr(stages, "plans", lambda photos, settings: [fast, wider])
+    placed, real = [], StructureFromMotion.map
+    monkeypatch.setattr(StructureFromMotion, "map", lambda *words: placed.append(words) or real(*words))
+    info = build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(factor=2), jobs=2).info
+    assert info["counts"]["registered"] == 8 and len(placed) == 1

@@ -84,6 +84,13 @@ class Camera:
         """Return points [..., 3] of the world in the camera's axes; z is the depth."""
         return points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
 
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixels [N, 2] and depths [N] of points [N, 3] of the world; NaN behind the camera."""
+        local = self.to_camera(points)
+        z = local[:, 2]
+        front = np.where(z > 0, z, np.nan)
+        return local[:, :2] / front[:, None] * [self.fx, self.fy] + [self.cx, self.cy], z
+
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image of another size; each axis scales by actual over model size."""
         sx, sy = width / self.width, height / self.height

@@ -7,9 +7,11 @@ with the one in the job: another version of the code, a plugin or the scene is a
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import platform
+import shutil
 import tempfile
 import time
 from collections.abc import Sequence
@@ -203,7 +205,9 @@ def _local_file(source: CodeSource) -> Path:
     with contextlib.suppress(OSError):  # the file is absent, or another user's
         if path.read_bytes() == source.content:
             return path
-    copy = Path(tempfile.mkdtemp(prefix="aw-source-")) / path.name
+    folder = Path(tempfile.mkdtemp(prefix="aw-source-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    copy = folder / path.name
     copy.write_bytes(source.content)
     return copy
 

@@ -117,10 +117,7 @@ def seen_by_others(scene: Scene, index: int, size: tuple[int, int]) -> np.ndarra
     well = np.diff(scene.points.track_offsets) >= 3
     if not well.any():
         return np.ones(size, bool)
-    local = scene.points.xyz[well] @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    local = local[local[:, 2] > 1e-6]
-    uv = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    uv = uv * [size[1] / camera.width, size[0] / camera.height]
+    uv = camera.project(scene.points.xyz[well])[0] * [size[1] / camera.width, size[0] / camera.height]
     columns, rows = uv[((uv >= 0) & (uv < [size[1], size[0]])).all(axis=1)].astype(int).T
     near = np.zeros(size, bool)
     near[rows, columns] = True

@@ -240,11 +240,8 @@ def _any_share(scene: Scene, xyz: np.ndarray, share: float) -> bool:
     seen = np.zeros(len(xyz), bool)
     for view in scene.train:
         camera = view.camera
-        local = camera.to_camera(xyz)
-        rows = np.flatnonzero(local[:, 2] > 0)
-        x, y, z = local[rows].T
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        seen[rows[(u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)]] = True
+        u, v = camera.project(xyz)[0].T
+        seen |= (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         if seen.mean() > share:
             return True
     return False

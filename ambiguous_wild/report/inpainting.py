@@ -111,12 +111,11 @@ class Inpainting:
     @staticmethod
     def _shows(camera: Camera, depth: np.ndarray, keep: np.ndarray, world: np.ndarray) -> np.ndarray:
         """Return which points [N, 3] a camera shows: in its frame, behind nothing, and not masked."""
-        local = camera.to_camera(world)
-        z = np.maximum(local[:, 2], 1e-9)
-        x, y = (camera.fx * local[:, 0] / z + camera.cx), (camera.fy * local[:, 1] / z + camera.cy)
-        inside = (local[:, 2] > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        pixels, z = camera.project(world)
+        x, y = pixels.T
+        inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
         column, row = np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int)
-        return inside & (keep[row, column] > 0) & (local[:, 2] <= BEHIND * depth[row, column])
+        return inside & (keep[row, column] > 0) & (z <= BEHIND * depth[row, column])
 
 
 def _world(camera: Camera, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:

@@ -170,12 +170,6 @@ class CutoutPlacement:
     standing: bool
 
 
-def project(camera: Camera, position: Sequence[float]) -> tuple[float, float, float]:
-    """Project a world point: u px, v px, depth in scene units."""
-    x, y, z = camera.cam_from_world[:3] @ np.append(np.asarray(position, float), 1.0)
-    return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, float(z)
-
-
 def layer(
     cutouts: Sequence[Cutout],
     heights: Sequence[float],
@@ -193,15 +187,16 @@ def layer(
         shadow: darkness of the shadow's centre, 0 (none) to 1 (black).
     """
     out = np.zeros((camera.height, camera.width, 4), np.float32)
-    placed = [(project(camera, s.position), s) for s in placements]
-    for (u, v, depth), placement in sorted(placed, key=lambda item: -item[0][2]):
+    pixels, depths = camera.project(np.array([s.position for s in placements], float).reshape(-1, 3))
+    for k in np.argsort(-depths, kind="stable"):
+        at, depth, placement = pixels[k], depths[k], placements[k]
         source, tall = cutouts[placement.which].light, camera.fy * heights[placement.which] / depth
         if shadow > 0:
-            dark = _warped(source[..., 3], tall, (u, v), placement, out.shape[:2], shadow=True)
+            dark = _warped(source[..., 3], tall, at, placement, out.shape[:2], shadow=True)
             dark = cv2.GaussianBlur(dark, (0, 0), max(_SHADOW_BLUR * tall, 0.5)) * np.float32(shadow)
             out *= 1 - dark[..., None]
             out[..., 3] += dark
-        over = _warped(source, tall, (u, v), placement, out.shape[:2], shadow=False)
+        over = _warped(source, tall, at, placement, out.shape[:2], shadow=False)
         out = over + (1 - over[..., 3:]) * out
     return out
 
@@ -209,7 +204,7 @@ def layer(
 def _warped(
     source: np.ndarray,
     tall: float,
-    at: tuple[float, float],
+    at: np.ndarray,  # [2] px
     placement: CutoutPlacement,
     shape: tuple[int, ...],
     shadow: bool,

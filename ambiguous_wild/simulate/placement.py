@@ -20,7 +20,6 @@ from ambiguous_wild.simulate.cutouts import (
     CutoutPlacement,
     cut_patch,
     layer,
-    project,
 )
 from ambiguous_wild.simulate.spec import FixedThing
 
@@ -87,9 +86,7 @@ def visible_points(scene: Scene) -> list[VisiblePoints]:
 def _site(view: View, points: SparsePoints, tracked: np.ndarray) -> VisiblePoints:
     xyz = points.xyz[tracked] if len(tracked) >= 10 else points.xyz
     camera = view.camera
-    local = xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    xyz, local = xyz[local[:, 2] > 0], local[local[:, 2] > 0]
-    uv = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    uv, _ = camera.project(xyz)
     inside = (uv > 0).all(1) & (uv < [camera.width, camera.height]).all(1)
     return VisiblePoints(view, xyz[inside], uv[inside])
 
@@ -198,7 +195,11 @@ def solve_heights(
         shares = [covered(small, natural * scale, s, c) for s, c in zip(placements, cameras, strict=True)]
         return float(np.mean(shares))
 
-    depths = [project(c, s.position)[2] for group, c in zip(placements, cameras, strict=True) for s in group]
+    depths = [
+        c.to_camera(np.array(s.position))[2]
+        for group, c in zip(placements, cameras, strict=True)
+        for s in group
+    ]
     if not depths:
         raise AwError("no photo shows a cut-out; raise --presence")
     focal = float(np.median([c.fy for c in cameras]))

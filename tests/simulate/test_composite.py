@@ -16,7 +16,7 @@ from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
 from ambiguous_wild.simulate.composite_scene import composite
-from ambiguous_wild.simulate.cutouts import project, read_cutouts
+from ambiguous_wild.simulate.cutouts import read_cutouts
 from ambiguous_wild.simulate.placement import (
     CompositeConfig,
     local_colours,
@@ -217,7 +217,7 @@ def test_patches_go_where_the_photo_is_like_them(base: Path) -> None:
     for lightness, right in ((16.0, False), (88.0, True)):
         stands = place(places, 1e-3, CONFIG, rng, 1, {0: np.array([lightness, 0, 0])}, around, away)
         sides = [
-            project(site.view.camera, s.position)[0] > middle
+            site.view.camera.project(np.array([s.position]))[0][0, 0] > middle
             for site, group, middle in zip(places, stands, middles, strict=True)
             for s in group
         ]

@@ -104,7 +104,7 @@ def free_space_violations(scene: Scene, keeps: Sequence[Tensor | None]) -> np.nd
         rows = rows[(z > 0) & (z < depth)]
         if not len(rows):
             continue
-        pixels, z = pixels_of(xyz[rows], camera)
+        pixels, z = camera.project(xyz[rows])
         free = z < SHARE * depth_around(pixels, xyz[judge], camera)
         if keep is not None:  # the photo's features there were not matched
             column, row = pixels.clip(0, (camera.width - 1, camera.height - 1)).astype(int).T
@@ -113,18 +113,11 @@ def free_space_violations(scene: Scene, keeps: Sequence[Tensor | None]) -> np.nd
     return violated >= VIOLATED
 
 
-def pixels_of(xyz: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels [N, 2] and depths [N] of points [N, 3] in front of a camera, in float64."""
-    local = camera.to_camera(xyz)
-    z = local[:, 2]
-    return local[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy), z
-
-
 def depth_around(pixels: np.ndarray, xyz: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the least depth of the triangle of points [M, 3] around each pixel, [N]; 0 outside of all."""
     from scipy.spatial import Delaunay, QhullError
 
-    corners, z = pixels_of(xyz[camera.to_camera(xyz)[:, 2] > 0], camera)
+    corners, z = camera.project(xyz[camera.to_camera(xyz)[:, 2] > 0])
     try:
         mesh = Delaunay(corners)
     except QhullError:  # all in a line

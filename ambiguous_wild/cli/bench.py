@@ -272,7 +272,7 @@ def command(
     if prepared is not None and not as_json:
         for folder in report.folders:
             _print_tables(prepared, folder, given["factor"])
-    finish(report, as_json)
+    finish(report, as_json, tabulated=prepared is not None)
 
 
 def _rare_settings(settings: Sequence[str]) -> tuple[dict[str, dict[str, Any]], list[str]]:

@@ -133,7 +133,7 @@ def _load_plugins(_: click.Context, __: click.Parameter, paths: tuple[Path, ...]
 
 _plugins = functools.partial(
     click.option, "--plugin", "plugins", multiple=True, type=PathName(),
-    help="A Python file that registers your methods; repeatable.",
+    help="FILE.py:RECIPE, or a Python file that registers your methods; repeatable.",
 )  # fmt: skip
 plugin_option = _plugins(callback=_load_plugins, expose_value=False)
 metric_file_option = click.option("--metric-file", "metrics", multiple=True, type=PathName(),

@@ -137,8 +137,13 @@ def ticking(**settings: Any) -> Iterator[Callable[[int, int | None], None]]:
             bar.close()
 
 
-def finish(report: BenchReport, as_json: bool) -> None:
+def finish(report: BenchReport, as_json: bool, *, tabulated: bool = False) -> None:
     """Print how the runs ended and how to compare them.
+
+    Args:
+        report: of the runs.
+        as_json: print it as JSON.
+        tabulated: the command has printed the tables of a suite.
 
     Raises:
         AwError: a run failed.
@@ -154,10 +159,14 @@ def finish(report: BenchReport, as_json: bool) -> None:
         raise AwError(failed[0].error)
     output = shlex.quote(str(report.output))
     compare = f"compare them with: aw {'cost' if len(folders) > 1 else 'table'} {output}"
+    if tabulated:
+        compare = "the same command prints these tables again"
     if len(folders) > 1:
         compare += f", or one folder with: aw table {shlex.quote(str(folders[0]))}"
     else:
-        compare += f", look at them with: aw view {output}"
+        scenes = sorted({run.folder.parent.parent for run in report.runs})
+        one = shlex.quote(str(scenes[0])) if len(scenes) > 1 else output
+        compare += f", look at them{' scene by scene' * (len(scenes) > 1)} with: aw view {one}"
     summary = ", ".join(f"{n} {outcome}" for outcome, n in report.outcomes.items())
     say(f"{count} run{'s' if count > 1 else ''}: {summary}; {compare}")
     if failed:

@@ -164,6 +164,8 @@ def describe_change(key: str, before: Flat, now: Flat, cell: Cell) -> str:
     """Return one difference in words of the command line."""
     if key == "source":
         return f"{_file_name(cell)} has changed since this run"
+    if key == "scene.sha256":
+        return "the scene's photos, poses or points differ"
     if key == "continued":
         return f"it {'went' if before.get(key) else 'did not go'} on from a shorter one"
     default = "full" if key == "protocol" else None  # a config leaves out the full protocol
@@ -227,7 +229,10 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
     keys = different_keys(before, now)
     changes = ", ".join(describe_change(key, before, now, cell) for key in keys[:4]) or "its hash"
     how = "changed" if made_anew(folder, "changed", cell.config) else "always"
-    longer = ", continue it with --overwrite longer" if keys and all(map(may_continue, keys)) else ""
+    trained = before.get("train.iterations")
+    shorter = isinstance(trained, int) and cell.train.iterations < trained
+    may = keys and all(map(may_continue, keys)) and not shorter
+    longer = ", continue it with --overwrite longer" if may else ""
     raise AwError(
         f"{folder} holds a run of another configuration ({changes}); choose another -o{longer}, or "
         f"replace it with --overwrite {how}{_hint_for_weights(cell, keys, before)}"

@@ -172,7 +172,11 @@ def _by_name(methods: Sequence[str | MethodEntry]) -> dict[str, MethodEntry]:
 
 def _listed(entry: MethodEntry) -> str:
     """Return where the keys of --set are listed."""
-    own = f"'aw methods {entry.name}' lists them; " if dataclasses.fields(entry.options()) else ""
+    own = (
+        f"'aw methods {entry.given_as or entry.name}' lists them; "
+        if dataclasses.fields(entry.options())
+        else ""
+    )
     return f"{own}for every method: train.KEY and engine.KEY of 'aw bench --help'"
 
 

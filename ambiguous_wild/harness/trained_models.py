@@ -335,7 +335,7 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
         chosen = from_plain(type(entry.options()), options, "options")
         hooks = entry.build(chosen)
     except AwError:
-        advice = "if it is a method of yours, name its file with --plugin"
+        advice = f"if it is a method of yours, add --plugin FILE.py:{name}"
         return RenderSettings(), f"{name} is an unknown method and drawn as plain 3DGS: {advice}"
     if entry.source_hash != source:
         return RenderSettings(), f"{name} has changed since the run, so it is drawn as plain 3DGS"

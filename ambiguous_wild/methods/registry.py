@@ -105,7 +105,7 @@ def get_method(name: str) -> MethodEntry:
         )
     in_any_case = [known for known in methods if known.casefold() == name.casefold()]
     if name not in methods and len(in_any_case) != 1:
-        raise unknown("method", name, methods, "'aw methods' lists them")
+        raise unknown("method", name, methods, "'aw methods' lists them; of a file: FILE.py:RECIPE")
     return methods[name if name in methods else in_any_case[0]]
 
 
@@ -127,16 +127,20 @@ def load_reference(name: str, *, given_as: str = "") -> MethodEntry:
 
 
 def load_plugin(path: Path | str) -> list[str]:
-    """Import a Python file that calls `register`; returns the names it added.
+    """Import a Python file that calls `register`, or FILE.py:RECIPE; returns the names it added.
 
     Raises:
         AwError: no such file, or it registers nothing.
     """
+    if is_reference(str(path)):
+        return [load_reference(str(path)).name]
     path, before = Path(path), dict(registered)
     _, digest = import_file(path)
     added = [key for key, entry in registered.items() if before.get(key) is not entry]
     if not added:
-        raise AwError(f"plugin {path} registers no method: call register(MethodEntry(...)) in it")
+        raise AwError(
+            f"plugin {path} registers no method: write {path}:RECIPE, or call register(MethodEntry(...))"
+        )
     for key in added:
         registered[key] = dataclasses.replace(registered[key], source_hash=digest)
     return added

@@ -81,7 +81,7 @@ def _check_root(suite: Suite, root: Path) -> None:
     if not is_free(root) and not (root / CAPTURES).is_dir():
         raise AwError(
             f"{root} exists and has no folder {CAPTURES} of {suite.name}: name a new or empty folder, or "
-            "that of an earlier 'aw fetch'"
+            f"that of an earlier 'aw fetch {suite.name}'; for a scene of your own leave --suite out"
         )
     check_output(root / CAPTURES / "capture")
 

@@ -56,6 +56,8 @@ def test_a_shorter_run_goes_on_and_says_so(scene, tmp_path):
     (folder / "mine.txt").write_text("a note")
     with pytest.raises(AwError, match=r"train\.iterations was 6, is 9\).*it with --overwrite longer"):
         run(scene, out, iterations=9)
+    with pytest.raises(AwError, match=r"train\.iterations was 6, is 3\); choose another -o, or replace"):
+        run(scene, out, iterations=3)
     report = run(scene, out, iterations=9, overwrite="longer")
     assert report.outcomes == {"trained": 1}
     assert "going on after 6 iterations" in (folder / "log.txt").read_text()

@@ -65,6 +65,16 @@ def test_a_plugin_imports_what_lies_beside_it_also_later(tmp_path, monkeypatch):
         sys.modules.pop(name)
 
 
+def test_a_recipe_in_a_file_is_a_plugin(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "from dataclasses import dataclass\n"
+        "from ambiguous_wild.splat.method_hooks import MethodHooks\n"
+        "@dataclass(frozen=True)\nclass Options:\n    share: float = 0.5\n"
+        "def mine(options: Options):\n    return MethodHooks()\n"
+    )
+    assert load_plugin(f"{tmp_path}/mine.py:mine") == ["mine"] and get_method("mine").source_hash
+
+
 def test_a_plugin_that_registers_nothing_is_refused(tmp_path):
     (tmp_path / "empty.py").write_text("x = 1\n")
     with pytest.raises(AwError, match="registers no method"):

@@ -202,7 +202,7 @@ def test_photos_that_are_all_masked_teach_nothing_and_are_named(scene, tmp_path)
     assert trainer.skipped_views == [v.name for v in scene.train]
 
 
-@pytest.mark.parametrize("value", [-5.0, 5.0, 1e30])
+@pytest.mark.parametrize("value", [-5.0, 5.0, 1e30, float("nan")])
 def test_keep_maps_of_absurd_values_are_refused(scene, tmp_path, value):
     class Absurd(MaskPolicy):
         def keep(self, step):

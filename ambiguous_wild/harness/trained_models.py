@@ -332,13 +332,16 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
             source, options = "", section(options, "host")
         if entry.program is not None:
             return RenderSettings(), ""
-        chosen = from_plain(type(entry.options()), options, "options")
-        hooks = entry.build(chosen)
     except AwError:
         advice = f"if it is a method of yours, add --plugin FILE.py:{name}"
         return RenderSettings(), f"{name} is an unknown method and drawn as plain 3DGS: {advice}"
+    changed = RenderSettings(), f"{name} has changed since the run, so it is drawn as plain 3DGS"
     if entry.source_hash != source:
-        return RenderSettings(), f"{name} has changed since the run, so it is drawn as plain 3DGS"
+        return changed
+    try:
+        hooks = entry.build(from_plain(type(entry.options()), options, "options"))
+    except AwError:
+        return changed
     antialias = hooks.antialias or "antialias" in (config.get("effects") or ())
     behind = section(config, "scene").get("background", hooks.background)
     red, green, blue = (float(value) for value in behind)

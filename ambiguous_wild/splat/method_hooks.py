@@ -200,7 +200,6 @@ class Schedule:
     lr_quats: float = 1e-3
     sh_every: float = 1000.0  # interval after which one more SH degree is used
     short_below: int = 15_000  # iterations; shorter runs use the values for short runs
-    per_pixel_short: float = 1.0  # Gaussians per pixel of a photo at most, in short runs
     resolution: Literal["full", "coarse-to-fine"] = "full"
 
 

@@ -102,7 +102,7 @@ def cap(
     if config.budget_s is None and config.iterations >= schedule.short_below:
         return most
     pixels = float(np.median([height * width for height, width in sizes]))
-    return min(most, max(start, int(schedule.per_pixel_short * pixels)))
+    return min(most, max(start, int(pixels)))
 
 
 class Pace:

@@ -179,7 +179,7 @@ def test_an_option_without_a_default_is_named(tmp_path):
         ("refinesplat", "psi.hidden=0", "psi.hidden is at least 1"),
         ("refinesplat", "psi.rate=-1", "psi.rate is at least"),
         ("refinesplat", "segments.k=0", "segments.k is at least"),
-        ("refinesplat", "per_pixel_short=-1", "per_pixel_short is at least"),
+        ("refinesplat", "lr_opacity=-1", "lr_opacity is at least"),
         ("robustsplat", "density.max_gaussians=0", "density.max_gaussians is at least 1"),
     ],
 )

@@ -111,7 +111,7 @@ def test_a_dense_start_leaves_room_to_grow(scene, tmp_path, monkeypatch):
     # without a limit, the photos' pixels set it in a short run
     pixels = float(np.median([p.shape[0] * p.shape[1] for p in plain.data.photos]))
     free = trainer_for(scene, tmp_path / "free", ("dense",))
-    assert len(free.gaussians.means) <= START_SHARE * MethodHooks().schedule.per_pixel_short * pixels
+    assert len(free.gaussians.means) <= START_SHARE * pixels
     assert free.pace.most == plain.pace.most
     full = trainer_for(scene, tmp_path / "full", ("dense",), max_gaussians=sparse)
     assert len(full.gaussians.means) == sparse and len(asked) == 2  # no room

@@ -137,7 +137,6 @@ class RefineSplatConfig:
     factor: Literal["keep", "transient"] = "keep"  # factor of L_GS; `transient` is M_final itself, as printed
     lr_opacity: float = 0.05  # 3DGS's present code has 0.025
     appearance: bool = False  # WildGaussians' embedding (32 a photo, 2 x 128), the paper's on Photo Tourism
-    per_pixel_short: float = 0.85  # most Gaussians per photo pixel in short runs; 1 for other methods
     identities: int = 255  # largest P
     identity_tracks: int = 3  # SfM tracks that two instances must share to be one identity
     identity_share: float = 0.25  # least share of the tracks of the instance with fewer
@@ -148,7 +147,7 @@ class RefineSplatConfig:
             self, "refinesplat",
             mask_every=(1, _ANY), entropy_every=(1, _ANY), lambda_dssim=(0, 1), identities=(1, 255),
             identity_tracks=(1, _ANY), identity_share=(0, 1), identity_similarity=(-1, 1),
-            per_pixel_short=(1e-3, _ANY), lr_opacity=(0, _ANY),
+            lr_opacity=(0, _ANY),
             **dict.fromkeys(
                 ("mask_start", "min_mask_start", "reset_pause", "min_reset_pause", "lambda_id", "lambda_cr",
                  "entropy_limit"), (0, _ANY),

@@ -86,7 +86,6 @@ class PaperConfig(RefineSplatConfig):
     entropy_limit: float = 0.1  # without, 7 dB below 3DGS (docs/fidelity.md)
     weigh_cr: bool = False
     entropy_every: int = 8  # PSNR is within 0.1 dB of the best interval's
-    per_pixel_short: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -326,6 +326,6 @@ def build(options: RefineSplatConfig) -> MethodHooks:
         density_config=options.density,
         lambda_dssim=options.lambda_dssim,
         weighting=options.ssim,
-        schedule=Schedule(per_pixel_short=options.per_pixel_short, lr_opacity=options.lr_opacity),
+        schedule=Schedule(lr_opacity=options.lr_opacity),
         effects=(WildAppearance(WildGaussiansConfig()),) if options.appearance else (),
     )

@@ -149,12 +149,14 @@ def _fitted(runs: Runs) -> list[str]:
     ok = runs.runs[runs.runs["status"] == "ok"]
     if not len(ok) or set(ok["fit"]) == {"full"}:
         return []
-    by_kind = {kind: sorted(set(of["method"])) for kind, of in ok.groupby("fit")}
-    return [
-        f"test photos: {shortlist(by_kind[kind], limit=30)}: {text}"
-        for kind, text in FITTED.items()
-        if kind in by_kind
-    ]
+    lines = []
+    for kind, text in FITTED.items():
+        of = ok[ok["fit"] == kind]
+        scenes = sorted(set(of["scene"]))
+        where = "" if len(scenes) == ok["scene"].nunique() else f" of {shortlist(scenes)}"
+        if scenes:
+            lines.append(f"test photos{where}: {shortlist(sorted(set(of['method'])), limit=30)}: {text}")
+    return lines
 
 
 def _unfitted(runs: Runs) -> list[str]:

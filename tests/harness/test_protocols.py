@@ -54,9 +54,14 @@ def test_results_of_before_are_not_taken_for_plain_ones(report, tmp_path):
     assert "not recorded" in " ".join(comparison(read_runs(folder))[-1].notes)
 
 
-def test_whole_photos_need_no_note():
-    frame = pd.DataFrame([{"status": "ok", "method": "3dgs", "fit": "full"}])
+def test_whole_photos_need_no_note_and_scenes_are_named_where_protocols_differ():
+    row = {"status": "ok", "method": "3dgs", "fit": "full", "scene": "yard"}
+    frame = pd.DataFrame([row])
     assert _fitted(Runs(pd.DataFrame(), frame, pd.DataFrame())) == []
+    both = pd.DataFrame([row, row | {"fit": "plain", "scene": "coats"}])
+    coats, yard = _fitted(Runs(pd.DataFrame(), both, pd.DataFrame()))
+    assert coats == "test photos of coats: 3dgs: nothing fitted, the right half measured"
+    assert yard == "test photos of yard: 3dgs: whole test photos measured, nothing fitted"
 
 
 @pytest.mark.parametrize(("method", "group"), [("gs-w", "plug-in"), ("wildgaussians", "plug-in")])

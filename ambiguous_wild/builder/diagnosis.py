@@ -98,19 +98,24 @@ def check_registered(
     )
 
 
+def verified_pairs(database: Path) -> dict[int, int]:
+    """Return the verified pairs of COLMAP's database by its `pair_id`, with their inliers, the most first."""
+    with closing(sqlite3.connect(database)) as db:
+        query = "SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0 ORDER BY rows DESC, pair_id"
+        return dict(db.execute(query).fetchall())
+
+
 def pair_facts(database: Path, matches: MatchResult) -> PairFacts:
     """Measure features, matches, and motion between the pairs with the most inliers."""
     with closing(sqlite3.connect(database)) as db:
         features = [r[0] for r in db.execute("SELECT rows FROM keypoints")]
-        pairs = db.execute(
-            "SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0 ORDER BY rows DESC, pair_id"
-        ).fetchall()
-    forward, angles = _motion(database, [pair_id for pair_id, _ in pairs[:_STRONG_PAIRS]])
+    pairs = verified_pairs(database)
+    forward, angles = _motion(database, list(pairs)[:_STRONG_PAIRS])
     return PairFacts(
         features=float(np.median(features)) if features else 0.0,
         tried=matches["pairs"],
         verified=len(pairs),
-        inliers=float(np.median([rows for _, rows in pairs])) if pairs else 0.0,
+        inliers=float(np.median(list(pairs.values()))) if pairs else 0.0,
         degenerate=matches["planar"] / len(pairs) if pairs else math.nan,
         forward=float(np.median(forward)) if forward else math.nan,
         angle_deg=float(np.median(angles)) if angles else math.nan,

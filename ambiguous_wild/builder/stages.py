@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from ambiguous_wild.builder import scene_record
 from ambiguous_wild.builder.collect import Capture
-from ambiguous_wild.builder.diagnosis import check_registered
+from ambiguous_wild.builder.diagnosis import check_registered, verified_pairs
 from ambiguous_wild.builder.keep_masks import (
     add_fixed,
     alpha_mask,
@@ -317,6 +317,7 @@ class Stages:
         before: SfmStages | None,
         known: ColmapModel | None,
     ) -> SfmStages:
+        """Return the results of a plan; those of the plan before where it finds the same pairs."""
         settings = self.settings
         sfm = StructureFromMotion(photos, screened.folder / "photos", settings, plan, self.jobs, self.bar)
         if known is None:
@@ -338,8 +339,8 @@ class Stages:
              earlier and earlier.matches.key, left_out, settings.seed],
             lambda f: sfm.match(f, features.folder, earlier.matches.folder if earlier else None, left_out),
         )  # fmt: skip
-        if earlier and matches.facts["verified"] == earlier.matches.facts["verified"]:
-            return earlier  # no new pair, so no other photo can be placed
+        if earlier and _same_pairs(earlier.matches, matches):
+            return earlier  # mapping would end as before
         mapping = work.run(
             "mapping",
             [matches.key, settings.mapper, settings.part, to_plain(plan), settings.seed,
@@ -347,6 +348,13 @@ class Stages:
             lambda f: sfm.map(f, matches.folder, matches.facts["connected"], known),
         )  # fmt: skip
         return SfmStages(features, matches, mapping)
+
+
+def _same_pairs(first: StageResult[MatchResult], second: StageResult[MatchResult]) -> bool:
+    """Whether two searches verified the same pairs with as many inliers, and found the same fixed areas."""
+    if first.facts["fixed"] != second.facts["fixed"]:
+        return False
+    return verified_pairs(first.folder / DATABASE) == verified_pairs(second.folder / DATABASE)
 
 
 def split_photos(photos: Sequence[ScreenedPhoto], registered: set[str], tests: set[str] | None) -> PhotoSplit:

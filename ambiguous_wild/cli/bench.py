@@ -269,10 +269,11 @@ def command(
         callbacks=Recorded(ctx, recorded, study, output),
         **given,
     )
+    printed = False
     if prepared is not None and not as_json:
         for folder in report.folders:
-            _print_tables(prepared, folder, given["factor"])
-    finish(report, as_json, tabulated=prepared is not None)
+            printed |= _print_tables(prepared, folder, given["factor"])
+    finish(report, as_json, tabulated=printed and given["overwrite"] in ("never", "missing"))
 
 
 def _rare_settings(settings: Sequence[str]) -> tuple[dict[str, dict[str, Any]], list[str]]:
@@ -353,7 +354,8 @@ def _made(suite: Suite, root: Path, poses: str, output: Path) -> PreparedSuite:
         return prepare_simulated(suite, root, exact_poses=poses == "truth", progress=True, say=say)
 
 
-def _print_tables(prepared: PreparedSuite, folder: Path, factor: int | None) -> None:
+def _print_tables(prepared: PreparedSuite, folder: Path, factor: int | None) -> bool:
+    """Print the suite's tables; tell whether there are any."""
     from ambiguous_wild.report.plain_formats import to_text
 
     try:
@@ -368,3 +370,5 @@ def _print_tables(prepared: PreparedSuite, folder: Path, factor: int | None) -> 
         click.echo(to_text(tables, color=sys.stdout.isatty(), width=line_width()), nl=False)
     except AwError as error:  # every run failed, which `finish` reports; or the board is damaged
         say(str(error))
+        return False
+    return True

@@ -164,8 +164,8 @@ def finish(report: BenchReport, as_json: bool, *, tabulated: bool = False) -> No
     if len(folders) > 1:
         compare += f", or one folder with: aw table {shlex.quote(str(folders[0]))}"
     else:
-        scenes = sorted({run.folder.parent.parent for run in report.runs})
-        one = shlex.quote(str(scenes[0])) if len(scenes) > 1 else output
+        scenes = sorted({run.folder.parent.parent.name for run in report.runs})
+        one = shlex.quote(str(folders[0] / scenes[0])) if len(scenes) > 1 else output
         compare += f", look at them{' scene by scene' * (len(scenes) > 1)} with: aw view {one}"
     summary = ", ".join(f"{n} {outcome}" for outcome, n in report.outcomes.items())
     say(f"{count} run{'s' if count > 1 else ''}: {summary}; {compare}")

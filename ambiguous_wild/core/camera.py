@@ -85,7 +85,7 @@ class Camera:
         return points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pixels [N, 2] and depths [N] of points [N, 3] of the world; NaN behind the camera."""
+        """Return the pixels [N, 2], NaN where z <= 0, and depths z [N] of points [N, 3] of the world."""
         local = self.to_camera(points)
         z = local[:, 2]
         front = np.where(z > 0, z, np.nan)

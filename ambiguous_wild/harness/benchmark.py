@@ -181,7 +181,7 @@ def bench(
             "mask" also a folder of masks.
         passes: 2 = train again from the start with the final masks; the runs are called METHOD+2passes.
         train: other settings of training.
-        plugins: Python files that register methods.
+        plugins: Python files that register methods, or FILE.py:RECIPE.
         metrics: Python files with your own metrics, see docs/metrics.md.
         device: where to train; "auto" = the GPU where it can be used.
         threads: threads of the CPU kernels; None = all cores. The result does not depend on it.

@@ -165,7 +165,7 @@ def describe_change(key: str, before: Flat, now: Flat, cell: Cell) -> str:
     if key == "source":
         return f"{_file_name(cell)} has changed since this run"
     if key == "scene.sha256":
-        return "the scene's photos, poses or points differ"
+        return "the scene's files, test photos or size differ"
     if key == "continued":
         return f"it {'went' if before.get(key) else 'did not go'} on from a shorter one"
     default = "full" if key == "protocol" else None  # a config leaves out the full protocol
@@ -229,8 +229,9 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
     keys = different_keys(before, now)
     changes = ", ".join(describe_change(key, before, now, cell) for key in keys[:4]) or "its hash"
     how = "changed" if made_anew(folder, "changed", cell.config) else "always"
-    trained = before.get("train.iterations")
-    shorter = isinstance(trained, int) and cell.train.iterations < trained
+    asked = before.get("train.iterations")
+    budgets = before.get("train.budget_s"), cell.train.budget_s
+    shorter = budgets == (None, None) and isinstance(asked, int) and cell.train.iterations < asked
     may = keys and all(map(may_continue, keys)) and not shorter
     longer = ", continue it with --overwrite longer" if may else ""
     raise AwError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -172,11 +173,8 @@ def _by_name(methods: Sequence[str | MethodEntry]) -> dict[str, MethodEntry]:
 
 def _listed(entry: MethodEntry) -> str:
     """Return where the keys of --set are listed."""
-    own = (
-        f"'aw methods {entry.given_as or entry.name}' lists them; "
-        if dataclasses.fields(entry.options())
-        else ""
-    )
+    command = shlex.join(["aw", "methods", entry.given_as or entry.name])
+    own = f"'{command}' lists them; " if dataclasses.fields(entry.options()) else ""
     return f"{own}for every method: train.KEY and engine.KEY of 'aw bench --help'"
 
 

@@ -69,7 +69,10 @@ def read_sources(
     plugins: Sequence[str | Path], methods: Sequence[str], metrics: Sequence[str | Path] = ()
 ) -> tuple[CodeSource, ...]:
     """Read the code of plugins, and of methods and metrics given as files; other methods need none."""
-    sources = [_source(str(path), "plugin", Path(path)) for path in plugins]
+    files = {str(path): reference_file(str(path)) for path in plugins}
+    sources = [
+        _source(text, "method" if file else "plugin", file or Path(text)) for text, file in files.items()
+    ]
     sources += [_source(str(path), "metric", Path(path)) for path in metrics]
     for name in methods:
         # the host of a graft may be a reference, and so may its donors

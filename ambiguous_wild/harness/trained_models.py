@@ -333,19 +333,19 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
         if entry.program is not None:
             return RenderSettings(), ""
     except AwError:
-        advice = f"if it is a method of yours, add --plugin FILE.py:{name}"
+        advice = "if it is a method of yours, add --plugin FILE.py:RECIPE"
         return RenderSettings(), f"{name} is an unknown method and drawn as plain 3DGS: {advice}"
-    changed = RenderSettings(), f"{name} has changed since the run, so it is drawn as plain 3DGS"
     if entry.source_hash != source:
-        return changed
+        return RenderSettings(), f"{name} has changed since the run, so it is drawn as plain 3DGS"
+    note = ""
     try:
         hooks = entry.build(from_plain(type(entry.options()), options, "options"))
-    except AwError:
-        return changed
+    except AwError as error:  # an option of another version
+        hooks, note = entry.build(entry.options()), f"{name} is drawn with its present defaults: {error}"
     antialias = hooks.antialias or "antialias" in (config.get("effects") or ())
     behind = section(config, "scene").get("background", hooks.background)
     red, green, blue = (float(value) for value in behind)
-    return RenderSettings(hooks.sh_degree, antialias, hooks.blur, (red, green, blue)), ""
+    return RenderSettings(hooks.sh_degree, antialias, hooks.blur, (red, green, blue)), note
 
 
 def _with_labels(trained: list[TrainedModel]) -> list[TrainedModel]:

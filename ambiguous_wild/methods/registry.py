@@ -29,6 +29,7 @@ from ambiguous_wild.methods.references import (
     import_file,
     is_reference,
     read_reference,
+    reference_file,
     without_recipe,
 )
 
@@ -130,9 +131,9 @@ def load_plugin(path: Path | str) -> list[str]:
     """Import a Python file that calls `register`, or FILE.py:RECIPE; returns the names it added.
 
     Raises:
-        AwError: no such file, or it registers nothing.
+        AwError: no such file, it registers nothing or has no such recipe, or another method has its name.
     """
-    if is_reference(str(path)):
+    if reference_file(str(path)) is not None:
         return [load_reference(str(path)).name]
     path, before = Path(path), dict(registered)
     _, digest = import_file(path)

@@ -288,7 +288,7 @@ def check_keep(keep: object, *, read: bool) -> None:
         )
     if read:
         low, high = keep.min().item(), keep.max().item()
-        if not (low >= -0.01 and high <= 1.01):  # rounding may leave the range; NaN is none
+        if not (low >= -0.01 and high <= 1.01):  # rounding may leave the range; NaN fails both comparisons
             raise AwError(
                 f"keep(step) of the method's mask policy gave values from {low:.3g} to {high:.3g}: "
                 "weights of pixels lie between 0, masked, and 1, kept"

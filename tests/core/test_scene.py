@@ -27,10 +27,10 @@ def test_resizing_scales_every_projection_per_axis():
 
 def test_points_are_projected_and_those_behind_have_no_pixel():
     camera = camera_at(0.3)
-    points = np.array([[0.2, -0.1, 4.0], [0.0, 0.5, 2.0], [0.0, 0.5, -2.0]])
+    points = np.array([[0.2, -0.1, 4.0], [0.0, 0.5, 2.0], [0.0, 0.5, -2.0], [0.0, 0.5, 0.0]])
     pixels, depths = camera.project(points)
     assert np.allclose(pixels[:2], [project(camera, point) for point in points[:2]])
-    assert np.isnan(pixels[2]).all() and np.allclose(depths, [4.0, 2.0, -2.0])
+    assert np.isnan(pixels[2:]).all() and np.allclose(depths, [4.0, 2.0, -2.0, 0.0])
 
 
 def test_center_is_where_the_camera_stands():

@@ -130,6 +130,13 @@ def job_of(cell, method, folder):
     return jobs.make_job(cell, cell_folder(folder / "runs", cell), RunOptions(folder / "c"), sources)
 
 
+def test_a_plugin_with_a_recipe_travels_as_a_method(tmp_path):
+    (tmp_path / "own.py").write_text("def mine(): ...\n")
+    (source,) = jobs.read_sources([tmp_path / "own.py:mine"], [])
+    assert (source.kind, source.text) == ("method", f"{tmp_path}/own.py:mine")
+    assert (source.path, source.content) == (str(tmp_path / "own.py"), b"def mine(): ...\n")
+
+
 def test_a_cell_that_kills_every_process_is_a_failure(cell, tmp_path):
     cell, job = cell
     killer = jobs.CodeSource(

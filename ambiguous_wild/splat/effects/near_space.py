@@ -77,12 +77,12 @@ def nearest_depths(cameras: Sequence[Camera], xyz: np.ndarray, seen: Sequence[np
 def free_space_violations(scene: Scene, keeps: Sequence[Tensor | None]) -> np.ndarray:
     """Return the SfM points [M] bool that lie in space which other photos show to be free.
 
-    Points of fewer than `MIN_TRACK` train photos are judged by those of more. Such a point is in free space
-    for a photo that does not see it if it lies there nearer than `SHARE` of the depth of the nearest of them,
-    and within a triangle of deeper ones (Delaunay): ground at the lower border has none below it. `VIOLATED`
-    such photos are needed. Such points are distractors that passed close to the cameras, and wrong matches.
-    Where masks hide them, the loss corrects nothing, and they are floaters in a test view between the train
-    photos.
+    Points of fewer than `MIN_TRACK` train photos are judged by the others. Such a point is in free space for
+    a photo that does not see it if it lies nearer than `SHARE` of the depth of the nearest of these in that
+    photo, and than `SHARE` of all corners of the triangle of these (Delaunay) that it lies in: ground at the
+    lower border has none below it. `VIOLATED` such photos are needed. Such points are distractors that passed
+    close to the cameras, and wrong matches. Where masks hide them, the loss corrects nothing, and they are
+    floaters in a test view between the train photos.
 
     Args:
         scene: scene with tracks.
@@ -106,6 +106,7 @@ def free_space_violations(scene: Scene, keeps: Sequence[Tensor | None]) -> np.nd
             continue
         pixels, z = camera.project(xyz[rows])
         free = z < SHARE * depth_around(pixels, xyz[judge], camera)
+        free &= ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(axis=1)
         if keep is not None:  # the photo's features there were not matched
             column, row = pixels.clip(0, (camera.width - 1, camera.height - 1)).astype(int).T
             free &= keep.cpu().numpy()[row, column] > 0.5

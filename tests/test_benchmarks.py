@@ -29,7 +29,9 @@ def test_a_script_starts(path, monkeypatch, capsys):
 
 def test_readme_and_docs_quote_the_demo_and_the_speed_of_the_result_files():
     root, results = BENCHMARKS.parent, BENCHMARKS / "results"
-    readme, docs = ((root / page).read_text(encoding="utf-8") for page in ("README.md", "docs/refinesplat.md"))
+    readme, docs = (
+        (root / page).read_text(encoding="utf-8") for page in ("README.md", "docs/refinesplat.md")
+    )
     with (results / "demo.csv").open(encoding="utf-8", newline="") as file:
         first, second = (float(row["psnr"]) for row in csv.DictReader(file))
     assert f"{first:.2f} dB with 3DGS and {second:.2f} dB with RefineSplat" in readme

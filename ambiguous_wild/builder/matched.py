@@ -8,15 +8,14 @@ from __future__ import annotations
 import copy
 import heapq
 import math
-import sqlite3
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ambiguous_wild.builder.diagnosis import verified_pairs
 from ambiguous_wild.builder.overlap_graph import component_labels
 from ambiguous_wild.builder.relative_poses import (
     MIN_INLIERS,
@@ -289,9 +288,7 @@ def largest_component(pairs: Collection[Pair]) -> int:
 
 def connected_photos(database: Path) -> int:
     """Return the largest number of photos that the verified pairs of COLMAP's database connect."""
-    with closing(sqlite3.connect(database)) as db:
-        numbers = [row[0] for row in db.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0")]
-    return largest_component([pycolmap.pair_id_to_image_pair(number) for number in numbers])
+    return largest_component([pycolmap.pair_id_to_image_pair(number) for number in verified_pairs(database)])
 
 
 def _well_connected(pairs: Collection[Pair]) -> set[int]:

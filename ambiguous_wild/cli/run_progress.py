@@ -158,9 +158,10 @@ def finish(report: BenchReport, as_json: bool, *, tabulated: bool = False) -> No
     if len(failed) == count == 1:
         raise AwError(failed[0].error)
     output = shlex.quote(str(report.output))
-    compare = f"compare them with: aw {'cost' if len(folders) > 1 else 'table'} {output}"
     if tabulated:
         compare = "the same command prints these tables again"
+    else:
+        compare = f"compare them with: aw {'cost' if len(folders) > 1 else 'table'} {output}"
     if len(folders) > 1:
         compare += f", or one folder with: aw table {shlex.quote(str(folders[0]))}"
     else:

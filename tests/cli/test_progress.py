@@ -7,6 +7,7 @@ import re
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -101,3 +102,20 @@ def test_quiet_verbose_and_the_log_of_a_run(words: list[str], tmp_path: Path) ->
     wrong = aw("table", tmp_path / "none", "-q")
     assert wrong.returncode == 2 and wrong.stderr.startswith("error: no folder of runs")
     assert "exclude each other" in aw("-q", "-v", "doctor").stderr
+
+
+@pytest.mark.parametrize(
+    ("scenes", "tabulated", "end"),
+    [
+        (("yard",), False, "compare them with: aw table runs, look at them with: aw view runs"),
+        (("yard", "hall"), False, "look at them scene by scene with: aw view runs/hall"),
+        (("yard", "hall"), True, "the same command prints these tables again, look at them scene by scene"),
+    ],
+)
+def test_the_end_names_commands_that_work(capsys, scenes, tabulated, end):
+    runs = [SimpleNamespace(folder=Path("/elsewhere/runs", scene, "3dgs/seed0")) for scene in scenes]
+    report = SimpleNamespace(
+        failed=[], runs=runs, folders=(Path("runs"),), output=Path("runs"), outcomes={"trained": len(runs)}
+    )
+    run_progress.finish(report, as_json=False, tabulated=tabulated)
+    assert end in " ".join(capsys.readouterr().err.split())

@@ -100,11 +100,11 @@ def free_space_violations(scene: Scene, keeps: Sequence[Tensor | None]) -> np.nd
         others = ~tracked
         others[own] = False
         rows = np.flatnonzero(others)
-        z = camera.to_camera(xyz[rows])[:, 2]
-        rows = rows[(z > 0) & (z < depth)]
-        if not len(rows):
-            continue
         pixels, z = camera.project(xyz[rows])
+        near = (z > 0) & (z < depth)
+        if not near.any():
+            continue
+        rows, pixels, z = rows[near], pixels[near], z[near]
         free = z < SHARE * depth_around(pixels, xyz[judge], camera)
         free &= ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(axis=1)
         if keep is not None:  # the photo's features there were not matched
@@ -118,7 +118,8 @@ def depth_around(pixels: np.ndarray, xyz: np.ndarray, camera: Camera) -> np.ndar
     """Return the least depth of the triangle of points [M, 3] around each pixel, [N]; 0 outside of all."""
     from scipy.spatial import Delaunay, QhullError
 
-    corners, z = camera.project(xyz[camera.to_camera(xyz)[:, 2] > 0])
+    corners, z = camera.project(xyz)
+    corners, z = corners[z > 0], z[z > 0]
     try:
         mesh = Delaunay(corners)
     except QhullError:  # all in a line

@@ -91,6 +91,12 @@ class Camera:
         front = np.where(z > 0, z, np.nan)
         return local[:, :2] / front[:, None] * [self.fx, self.fy] + [self.cx, self.cy], z
 
+    def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Return the points [N, 3] of the world at pixels [N, 2] and depths z [N]."""
+        x, y = ((pixels - [self.cx, self.cy]) / [self.fx, self.fy] * depth[:, None]).T
+        rotation, translation = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
+        return (np.stack([x, y, depth], axis=1) - translation) @ rotation
+
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image of another size; each axis scales by actual over model size."""
         sx, sy = width / self.width, height / self.height

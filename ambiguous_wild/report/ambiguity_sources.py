@@ -177,7 +177,7 @@ class RunBackground:
         image, alpha, depth = self._render(view.camera)
         known = alpha >= OPAQUE
         rows, cols = np.nonzero(known & self.masks.load(view))
-        points = unproject(view.camera, rows, cols, depth[rows, cols])
+        points = view.camera.unproject(np.column_stack([cols, rows]) + 0.5, depth[rows, cols])
         seen = np.zeros(len(rows), int)
         for other, coarse in self._depth.items():
             if other != index:
@@ -259,19 +259,6 @@ def check_run(scene: Scene, run: Path) -> None:
             f"{run} was trained on scene {name!r} with other photos, split or size than {scene.root}; "
             "train on this one: 'aw bench --scene'"
         )
-
-
-def unproject(
-    camera: Camera,
-    rows: np.ndarray,  # [P]
-    cols: np.ndarray,  # [P]
-    depth: np.ndarray,  # [P] z
-) -> np.ndarray:  # [P, 3] world
-    """Return the world points of pixel centres at a depth."""
-    x = (cols + 0.5 - camera.cx) / camera.fx * depth
-    y = (rows + 0.5 - camera.cy) / camera.fy * depth
-    rotation, translation = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
-    return (np.stack([x, y, depth], axis=1) - translation) @ rotation
 
 
 def sees(

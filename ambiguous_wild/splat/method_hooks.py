@@ -22,8 +22,8 @@ from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.io.mask_reasons import MaskReasons
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.effects.near_space import free_space_violations
 from ambiguous_wild.splat.fields import Fields
+from ambiguous_wild.splat.free_space import free_space_violations
 from ambiguous_wild.splat.gaussians import MIN_POINTS, Gaussians
 from ambiguous_wild.splat.render import BLUR
 from ambiguous_wild.splat.rendered import Cotangents, Gradients, Rendered
@@ -254,7 +254,8 @@ class MethodHooks:
         if self.start is not None and self.given is None:
             return self.start(data)
         if self.given is None:
-            sparse, out = data.scene.points, free_space_violations(data.scene, data.user_keep)
+            sparse = data.scene.points
+            out = free_space_violations(data.scene, data.photos, data.user_keep)
             xyz, rgb = sparse.xyz[~out], sparse.rgb[~out]
             LOG.debug("%d of %d sparse points left out: in the free space of photos", out.sum(), len(out))
         else:

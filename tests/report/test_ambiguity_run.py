@@ -18,7 +18,7 @@ from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.io.ply import write_splat_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics.ambiguity import COLOUR_METRIC
-from ambiguous_wild.report.ambiguity_sources import RunBackground, find_masks, sees, unproject
+from ambiguous_wild.report.ambiguity_sources import RunBackground, find_masks, sees
 from tests.tiny_scene import TRAIN, WALL_Z, wall_colour, write_tiny_scene
 
 
@@ -105,7 +105,7 @@ def test_points_go_there_and_back() -> None:
     pose[:3, 3] = (0.3, -0.2, 0.5)
     camera = Camera(64, 48, 60.0, 61.0, 31.0, 25.0, pose)
     rows, cols, depth = np.array([0, 20, 47]), np.array([0, 33, 63]), np.array([2.0, 3.0, 4.0])
-    points = unproject(camera, rows, cols, depth)
+    points = camera.unproject(np.column_stack([cols, rows]) + 0.5, depth)
     surface = np.full((48, 64), 9.0)
     surface[rows, cols] = depth
     assert sees(camera, surface, surface > 0, points).all()

@@ -1,9 +1,8 @@
-"""The space close in front of the cameras, where nothing belongs: no floaters, no wrong SfM points.
+"""The space close in front of the cameras, where nothing belongs: no floaters.
 
 Floaters there explain one photo, and no other photo corrects them. With the effect `near`, what lies in a
 camera's picture nearer than a share of the depth of its nearest SfM points becomes transparent, and density
-control, while it works, removes it. Every run leaves out start points that violate the free space of other
-photos.
+control, while it works, removes it.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core import Camera, Scene
+from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.geometry import inside, projected
@@ -26,8 +25,6 @@ SHARE = 0.6  # share of the depth of the nearest points below which nothing belo
 NEAREST = 0.02  # quantile of depths that counts as that depth
 FEW_POINTS = 20  # cameras with fewer points are ignored
 EVERY = 50  # iterations
-MIN_TRACK = 3  # train photos that must see a point, so that each is checked by two others
-VIOLATED = 2  # photos whose free space a point must violate; one may have missed it
 GONE = -9.0  # logit of opacity, so low that density control removes the Gaussian before Adam can raise it
 
 
@@ -72,57 +69,3 @@ def nearest_depths(cameras: Sequence[Camera], xyz: np.ndarray, seen: Sequence[np
         depth = depth[depth > 0]
         depths.append(SHARE * float(np.quantile(depth, NEAREST)) if len(depth) >= FEW_POINTS else 0.0)
     return depths
-
-
-def free_space_violations(scene: Scene, keeps: Sequence[Tensor | None]) -> np.ndarray:
-    """Return the SfM points [M] bool that lie in space which other photos show to be free.
-
-    Points of fewer than `MIN_TRACK` train photos are judged by the others. Such a point is in free space for
-    a photo that does not see it if it lies nearer than `SHARE` of the depth of the nearest of these in that
-    photo, and than `SHARE` of all corners of the triangle of these (Delaunay) that it lies in: ground at the
-    lower border has none below it. `VIOLATED` such photos are needed. Such points are distractors that passed
-    close to the cameras, and wrong matches. Where masks hide them, the loss corrects nothing, and they are
-    floaters in a test view between the train photos.
-
-    Args:
-        scene: scene with tracks.
-        keeps: keep map [H, W] of each train photo, or None.
-    """
-    xyz, seen = scene.points.xyz, tracks_of(scene)
-    length = np.bincount(np.concatenate([np.zeros(0, np.int64), *seen]), minlength=len(xyz))
-    tracked = length >= MIN_TRACK
-    cameras = [view.camera for view in scene.train]
-    violated = np.zeros(len(xyz), np.int64)
-    judges = [rows[tracked[rows]] for rows in seen]
-    for camera, own, judge, depth, keep in zip(
-        cameras, seen, judges, nearest_depths(cameras, xyz, judges), keeps, strict=True
-    ):
-        others = ~tracked
-        others[own] = False
-        rows = np.flatnonzero(others)
-        pixels, z = camera.project(xyz[rows])
-        near = (z > 0) & (z < depth)
-        if not near.any():
-            continue
-        rows, pixels, z = rows[near], pixels[near], z[near]
-        free = z < SHARE * depth_around(pixels, xyz[judge], camera)
-        free &= ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(axis=1)
-        if keep is not None:  # the photo's features there were not matched
-            column, row = pixels.clip(0, (camera.width - 1, camera.height - 1)).astype(int).T
-            free &= keep.cpu().numpy()[row, column] > 0.5
-        violated[rows] += free
-    return violated >= VIOLATED
-
-
-def depth_around(pixels: np.ndarray, xyz: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the least depth of the triangle of points [M, 3] around each pixel, [N]; 0 outside of all."""
-    from scipy.spatial import Delaunay, QhullError
-
-    corners, z = camera.project(xyz)
-    corners, z = corners[z > 0], z[z > 0]
-    try:
-        mesh = Delaunay(corners)
-    except QhullError:  # all in a line
-        return np.zeros(len(pixels))
-    triangle = mesh.find_simplex(pixels)
-    return np.where(triangle < 0, 0.0, z[mesh.simplices[triangle]].min(axis=1))

@@ -54,7 +54,7 @@ def free_space_violations(
     judges = [rows[length[rows] >= MIN_TRACK] for rows in seen]
     if not any(map(len, judges)):
         return np.zeros(len(xyz), bool)
-    colours = [_ReducedPhoto.of(photo, camera) for photo, camera in zip(photos, cameras, strict=True)]
+    colours = [_PhotoColours.of(photo, camera) for photo, camera in zip(photos, cameras, strict=True)]
     of_point = _mean_colours(colours, cameras, seen, xyz)
     depths = nearest_depths(cameras, xyz, judges)
     centres = np.stack([camera.center for camera in cameras])
@@ -138,14 +138,14 @@ class _ObservedSurface:
 
 
 @dataclass(frozen=True)
-class _ReducedPhoto:
+class _PhotoColours:
     """The colours of a photo, reduced: depth is off by a few pixels, and many photos must fit."""
 
     pixels: np.ndarray  # [h, w, 3] uint8
     scale: np.ndarray  # [2] columns and rows for a px of the camera
 
     @classmethod
-    def of(cls, photo: Tensor, camera: Camera) -> _ReducedPhoto:
+    def of(cls, photo: Tensor, camera: Camera) -> _PhotoColours:
         whole = (photo.cpu().numpy() * 255.0 + 0.5).astype(np.uint8)
         share = min(math.sqrt(PIXELS / (whole.shape[0] * whole.shape[1])), 1.0)
         w, h = (max(round(side * share), 1) for side in (whole.shape[1], whole.shape[0]))
@@ -160,7 +160,7 @@ class _ReducedPhoto:
 
 
 def _mean_colours(
-    colours: Sequence[_ReducedPhoto], cameras: Sequence[Camera], seen: Sequence[np.ndarray], xyz: np.ndarray
+    colours: Sequence[_PhotoColours], cameras: Sequence[Camera], seen: Sequence[np.ndarray], xyz: np.ndarray
 ) -> np.ndarray:
     """Return the mean colour of each point [M, 3] in the photos that observe it; NaN where none does."""
     total, count = np.zeros((len(xyz), 3)), np.zeros((len(xyz), 1))

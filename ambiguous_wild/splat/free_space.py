@@ -81,21 +81,36 @@ def free_space_violations(
         shown = colours[view].at(pixels[rows])
         own = _distance(shown, of_point[rows]) <= SAME
         behind = camera.unproject(pixels[rows], surface.depth(triangle, pixels[rows]))
-        votes, frames = np.zeros((2, len(rows)), np.int64)
         away = np.linalg.norm(centres - centres[view], axis=1)
-        for other in np.argsort(away, kind="stable")[1 : NEIGHBOURS + 1]:
-            beside = cameras[other]
-            where, depth = beside.project(behind)
-            hidden = np.linalg.norm(where - beside.project(xyz[rows])[0], axis=1)
-            size = np.array([beside.width, beside.height])
-            within = (depth > 0) & ((where >= 0) & (where < size)).all(axis=1)
-            within &= ~(hidden <= APART * size.max())
-            frames += within
-            votes[within] += _distance(colours[other].at(where[within]), shown[within]) <= SAME
-        through = small & ~own & (votes >= np.maximum(CONFIRM, CONFIRM_SHARE * frames))
+        nearest = [other for other in np.argsort(away, kind="stable") if other != view][:NEIGHBOURS]
+        others = [(cameras[other], colours[other]) for other in nearest]
+        through = small & ~own & _confirmed(behind, shown, xyz[rows], others)
         violated[rows] += near | through
         alike[rows] += small & own
     return (violated >= VIOLATED) & (ALIKE_TO_VIOLATED * violated > alike)
+
+
+def _confirmed(
+    behind: np.ndarray, shown: np.ndarray, points: np.ndarray, others: Sequence[tuple[Camera, _PhotoColours]]
+) -> np.ndarray:
+    """Return whether enough other photos show the same colour on the surface, [N] bool.
+
+    Args:
+        behind: [N, 3] places on the surface.
+        shown: [N, 3] colours there.
+        points: [N, 3] points in front of them, which hide them in photos that have both at one place.
+        others: cameras and colours of the photos.
+    """
+    votes, frames = np.zeros((2, len(behind)), np.int64)
+    for camera, colours in others:
+        pixels, z = camera.project(behind)
+        size = np.array([camera.width, camera.height])
+        within = (z > 0) & ((pixels >= 0) & (pixels < size)).all(axis=1)
+        beside = np.linalg.norm(pixels - camera.project(points)[0], axis=1)
+        within &= ~(beside <= APART * size.max())  # NaN: behind the camera
+        frames += within
+        votes[within] += _distance(colours.at(pixels[within]), shown[within]) <= SAME
+    return np.asarray(votes >= np.maximum(CONFIRM, CONFIRM_SHARE * frames))
 
 
 @dataclass(frozen=True)

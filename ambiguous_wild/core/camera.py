@@ -91,6 +91,10 @@ class Camera:
         front = np.where(z > 0, z, np.nan)
         return local[:, :2] / front[:, None] * [self.fx, self.fy] + [self.cx, self.cy], z
 
+    def has(self, pixels: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Return which pixels [N, 2] and depths [N] of `project` lie in the frame, [N] bool."""
+        return (z > 0) & ((pixels >= 0) & (pixels < (self.width, self.height))).all(axis=1)
+
     def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Return the points [N, 3] of the world at pixels [N, 2] and depths z [N]."""
         x, y = ((pixels - [self.cx, self.cy]) / [self.fx, self.fy] * depth[:, None]).T

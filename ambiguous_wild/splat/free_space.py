@@ -15,102 +15,101 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from ambiguous_wild.core import Camera, Scene
+from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.effects.near_space import SHARE, nearest_depths
-from ambiguous_wild.splat.effects.tracks import tracks_of
+from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, tracks_of
+from ambiguous_wild.splat.step import TrainData
 
 if TYPE_CHECKING:
     from scipy.spatial import Delaunay
 
-MIN_TRACK = 3  # train photos that see the points of which surfaces are made
+MIN_TRACK = 3  # train photos that observe the points of which surfaces are made
 VIOLATED = 2  # photos whose free space a point must violate; one may have missed it
-ALIKE_TO_VIOLATED = 4  # and no more than this many times as many photos may show its colour at its place
-IN_FRONT = 0.9  # share of the depth of the surface up to which a point is in front of it
-EDGE = 0.3  # share of the photo's longer side; triangles with longer edges tell nothing of the surface
+AGREEING = 4  # a point stays if this many times as many photos show its colour at its place
+IN_FRONT = 0.9  # share of the surface's depth below which a point is in front of it
+EDGE = 0.3  # share of the photo's longer side; triangles with longer edges say nothing of colours
 SAME = 0.06  # mean difference of colours in [0, 1] up to which two are the same
-NEIGHBOURS = 12  # nearest train photos that may show the same surface
-CONFIRM, CONFIRM_SHARE = 2, 0.3  # of these, so many must, and this share of those that have it in their frame
-APART = 0.015  # share of the longer side by which the point must not hide the surface there
+NEIGHBOURS, MOST_ASKED = 12, 60  # nearest other train photos that are asked about a place; of so many
+CONFIRM, CONFIRM_SHARE = 2, 0.3  # of these, so many must show the colour, and this share
+APART = 0.015  # share of the longer side; a photo that has point and place closer together is not asked
 PIXELS = 20_000  # of the reduced photos that colours are read from
 
 
-def free_space_violations(
-    scene: Scene, photos: Iterable[Tensor], keeps: Sequence[Tensor | None]
-) -> np.ndarray:
-    """Return the SfM points [M] bool that lie in space which other photos show to be free.
+def free_space_violations(data: TrainData) -> np.ndarray:
+    """Return the SfM points [M] bool that lie in space which photos show to be free.
 
     The surface that a photo sees is the Delaunay triangulation of the points of long tracks that it observes.
-    A point in front of its triangle, which the photo does not observe, violates the photo's free space if the
-    photo shows another colour there, and other photos show that colour on the surface; or if it is close to
-    the camera and few photos see it: where masks hide it in these, the loss corrects nothing.
+    A point in front of it, which the photo does not observe, violates the photo's free space if
 
-    Args:
-        scene: scene with tracks.
-        photos: [H, W, 3] in [0, 1] of each train photo; read once.
-        keeps: keep map [H, W] of each train photo, or None.
+    - the photo shows another colour there, and enough other photos confirm that colour on the surface;
+    - or the point has a short track and is nearer than `SHARE` of the nearest points, and of its triangle.
+
+    Colours are divided by the exposure gains of their photos. Masked pixels say nothing.
     """
-    xyz, seen, cameras = scene.points.xyz, tracks_of(scene), [view.camera for view in scene.train]
-    length = np.bincount(np.concatenate([np.zeros(0, np.int64), *seen]), minlength=len(xyz))
-    judges = [rows[length[rows] >= MIN_TRACK] for rows in seen]
-    if not any(map(len, judges)):
+    xyz, cameras = data.scene.points.xyz, data.cameras
+    photos = [
+        _PhotoColours.of(photo, camera, keep)
+        for photo, camera, keep in zip(data.photos, cameras, data.user_keep, strict=True)
+    ]
+    inside = [camera.has(*camera.project(xyz)) for camera in cameras]
+    observed = [rows[within[rows]] for rows, within in zip(tracks_of(data.scene), inside, strict=True)]
+    length = np.bincount(np.concatenate([np.zeros(0, np.int64), *observed]), minlength=len(xyz))
+    of_surface = [rows[length[rows] >= MIN_TRACK] for rows in observed]
+    if not any(map(len, of_surface)):
         return np.zeros(len(xyz), bool)
-    colours = [_PhotoColours.of(photo, camera) for photo, camera in zip(photos, cameras, strict=True)]
-    of_point = _mean_colours(colours, cameras, seen, xyz)
-    depths = nearest_depths(cameras, xyz, judges)
+    of_point = _divide_by_gains(photos, cameras, observed, xyz)
+    depths = nearest_depths(cameras, xyz, of_surface)
     centres = np.stack([camera.center for camera in cameras])
-    violated, alike = np.zeros((2, len(xyz)), np.int64)
+    violated, agreeing = np.zeros((2, len(xyz)), np.int64)
     for view, camera in enumerate(cameras):
         pixels, z = camera.project(xyz)
-        surface = _ObservedSurface.of(pixels[judges[view]], z[judges[view]])
+        surface = _ObservedSurface.of(pixels[of_surface[view]], z[of_surface[view]])
         if surface is None:
             continue
-        asked = (z > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-        asked[seen[view]] = False
-        keep = keeps[view]
-        if keep is not None:  # the photo's features there were not matched
-            rows = np.flatnonzero(asked)
-            column, row = pixels[rows].astype(int).T
-            asked[rows] = keep.cpu().numpy()[row, column] > 0.5
-        rows = np.flatnonzero(asked)
+        inside[view][observed[view]] = False
+        rows = np.flatnonzero(inside[view])
         triangle = surface.triangle(pixels[rows])
         least = surface.least_depth(triangle)
-        front = z[rows] < IN_FRONT * least
-        rows, triangle, least = rows[front], triangle[front], least[front]
+        shown = photos[view].at(pixels[rows])
+        asked = (z[rows] < IN_FRONT * least) & np.isfinite(shown).all(axis=1)
+        rows, triangle, least, shown = rows[asked], triangle[asked], least[asked], shown[asked]
         near = (z[rows] < np.minimum(SHARE * least, depths[view])) & (length[rows] < MIN_TRACK)
         small = surface.longest_edge(triangle) < EDGE * max(camera.width, camera.height)
-        shown = colours[view].at(pixels[rows])
-        own = _distance(shown, of_point[rows]) <= SAME
+        agrees = _distance(shown, of_point[rows]) <= SAME
         behind = camera.unproject(pixels[rows], surface.depth(triangle, pixels[rows]))
         away = np.linalg.norm(centres - centres[view], axis=1)
-        nearest = [other for other in np.argsort(away, kind="stable") if other != view][:NEIGHBOURS]
-        others = [(cameras[other], colours[other]) for other in nearest]
-        through = small & ~own & _confirmed(behind, shown, xyz[rows], others)
-        violated[rows] += near | through
-        alike[rows] += small & own
-    return (violated >= VIOLATED) & (ALIKE_TO_VIOLATED * violated > alike)
+        nearest = [other for other in np.argsort(away, kind="stable") if other != view][:MOST_ASKED]
+        others = ((cameras[other], photos[other]) for other in nearest)
+        violated[rows] += near | (small & ~agrees & _confirmed(behind, shown, xyz[rows], others))
+        agreeing[rows] += small & agrees
+    return (violated >= VIOLATED) & (AGREEING * violated > agreeing)
 
 
 def _confirmed(
-    behind: np.ndarray, shown: np.ndarray, points: np.ndarray, others: Sequence[tuple[Camera, _PhotoColours]]
+    behind: np.ndarray, shown: np.ndarray, points: np.ndarray, others: Iterable[tuple[Camera, _PhotoColours]]
 ) -> np.ndarray:
-    """Return whether enough other photos show the same colour on the surface, [N] bool.
+    """Return whether enough of the first `NEIGHBOURS` photos that can tell show the same colour, [N] bool.
 
     Args:
         behind: [N, 3] places on the surface.
         shown: [N, 3] colours there.
-        points: [N, 3] points in front of them, which hide them in photos that have both at one place.
-        others: cameras and colours of the photos.
+        points: [N, 3] points in front of them.
+        others: cameras and colours of the other photos, in the order in which they are asked.
     """
-    votes, frames = np.zeros((2, len(behind)), np.int64)
-    for camera, colours in others:
-        pixels, z = camera.project(behind)
-        size = np.array([camera.width, camera.height])
-        within = (z > 0) & ((pixels >= 0) & (pixels < size)).all(axis=1)
-        beside = np.linalg.norm(pixels - camera.project(points)[0], axis=1)
-        within &= ~(beside <= APART * size.max())  # NaN: behind the camera
-        frames += within
-        votes[within] += _distance(colours.at(pixels[within]), shown[within]) <= SAME
-    return np.asarray(votes >= np.maximum(CONFIRM, CONFIRM_SHARE * frames))
+    votes, answers = np.zeros((2, len(behind)), np.int64)
+    for camera, photo in others:
+        rows = np.flatnonzero(answers < NEIGHBOURS)
+        if not len(rows):
+            break
+        pixels, z = camera.project(behind[rows])
+        beside = np.linalg.norm(pixels - camera.project(points[rows])[0], axis=1)
+        tells = camera.has(pixels, z) & ~(
+            beside <= APART * max(camera.width, camera.height)
+        )  # NaN: behind it
+        rows, colours = rows[tells], photo.at(pixels[tells])
+        answers[rows] += np.isfinite(colours).all(axis=1)
+        votes[rows] += _distance(colours, shown[rows]) <= SAME
+    return np.asarray(votes >= np.maximum(CONFIRM, CONFIRM_SHARE * answers))
 
 
 @dataclass(frozen=True)
@@ -152,38 +151,58 @@ class _ObservedSurface:
         return 1.0 / (weights / self.z[self.mesh.simplices[triangle]]).sum(axis=1)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _PhotoColours:
     """The colours of a photo, reduced: depth is off by a few pixels, and many photos must fit."""
 
     pixels: np.ndarray  # [h, w, 3] uint8
+    masked: np.ndarray  # [h, w] bool
     scale: np.ndarray  # [2] columns and rows for a px of the camera
+    gain: np.ndarray  # [3] of the photo's exposure
 
     @classmethod
-    def of(cls, photo: Tensor, camera: Camera) -> _PhotoColours:
-        whole = (photo.cpu().numpy() * 255.0 + 0.5).astype(np.uint8)
-        share = min(math.sqrt(PIXELS / (whole.shape[0] * whole.shape[1])), 1.0)
-        w, h = (max(round(side * share), 1) for side in (whole.shape[1], whole.shape[0]))
-        small = cv2.resize(whole, (w, h), interpolation=cv2.INTER_AREA)
-        return cls(small, np.array([w / camera.width, h / camera.height]))
+    def of(cls, photo: Tensor, camera: Camera, keep: Tensor | None) -> _PhotoColours:
+        height, width = photo.shape[:2]
+        share = min(math.sqrt(PIXELS / (height * width)), 1.0)
+        size = w, h = max(round(share * width), 1), max(round(share * height), 1)
+        whole = (photo.clamp(0.0, 1.0).cpu().numpy() * 255.0 + 0.5).astype(np.uint8)
+        small = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
+        masked = np.zeros((h, w), bool)
+        if keep is not None:
+            masked = cv2.resize(keep.float().cpu().numpy(), size, interpolation=cv2.INTER_AREA) < 1.0
+        return cls(small, masked, np.array([w / camera.width, h / camera.height]), np.ones(3))
 
     def at(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the colours [N, 3] float64 in [0, 1] at pixels [N, 2] of the camera."""
-        h, w = self.pixels.shape[:2]
+        """Return the colours [N, 3] float64 at pixels [N, 2] inside the camera's frame; NaN where masked."""
+        h, w = self.masked.shape
         column, row = (pixels * self.scale).astype(int).clip(0, (w - 1, h - 1)).T
-        return self.pixels[row, column] / 255.0
+        colours = self.pixels[row, column] / 255.0 / self.gain
+        colours[self.masked[row, column]] = np.nan
+        return colours
 
 
-def _mean_colours(
-    colours: Sequence[_PhotoColours], cameras: Sequence[Camera], seen: Sequence[np.ndarray], xyz: np.ndarray
+def _divide_by_gains(
+    photos: Sequence[_PhotoColours],
+    cameras: Sequence[Camera],
+    observed: Sequence[np.ndarray],
+    xyz: np.ndarray,
 ) -> np.ndarray:
-    """Return the mean colour of each point [M, 3] in the photos that observe it; NaN where none does."""
+    """Set the gains of the photos; return the mean colour of each point [M, 3], NaN where none shows it."""
+
+    def read() -> TrackColours:
+        rgb = [
+            photo.at(camera.project(xyz[rows])[0])
+            for photo, camera, rows in zip(photos, cameras, observed, strict=True)
+        ]
+        view = np.repeat(np.arange(len(photos)), [len(rows) for rows in observed])
+        return TrackColours(np.concatenate(observed), view, np.concatenate(rgb)).usable()
+
+    for photo, gain in zip(photos, np.exp(log_gains(read(), len(photos))), strict=True):
+        photo.gain = gain
+    colours = read()
     total, count = np.zeros((len(xyz), 3)), np.zeros((len(xyz), 1))
-    for photo, camera, rows in zip(colours, cameras, seen, strict=True):
-        pixels, z = camera.project(xyz[rows])
-        rows, pixels = rows[z > 0], pixels[z > 0]
-        total[rows] += photo.at(pixels)
-        count[rows] += 1
+    np.add.at(total, colours.point, colours.rgb)
+    np.add.at(count, colours.point, 1)
     return total / np.where(count > 0, count, np.nan)
 
 

@@ -254,8 +254,7 @@ class MethodHooks:
         if self.start is not None and self.given is None:
             return self.start(data)
         if self.given is None:
-            sparse = data.scene.points
-            out = free_space_violations(data.scene, data.photos, data.user_keep)
+            sparse, out = data.scene.points, free_space_violations(data)
             xyz, rgb = sparse.xyz[~out], sparse.rgb[~out]
             LOG.debug("%d of %d sparse points left out: in the free space of photos", out.sum(), len(out))
         else:

@@ -21,6 +21,11 @@ class TrackColours:
     view: np.ndarray  # [L] int64, index into Scene.train
     rgb: np.ndarray  # [L, 3] float64 in (0, 1), sRGB, mean of 3x3 px
 
+    def usable(self) -> TrackColours:
+        """Leave out what is black, clipped or unknown."""
+        some = ((self.rgb > DARK) & (self.rgb < BRIGHT)).all(axis=1)
+        return TrackColours(self.point[some], self.view[some], self.rgb[some])
+
 
 def tracks_of(scene: Scene) -> list[np.ndarray]:
     """Return for each train photo the sorted indices of its sparse points."""
@@ -57,11 +62,10 @@ def track_colours(scene: Scene, photos: Iterable[np.ndarray]) -> TrackColours:
         rgb = np.stack(
             [map_coordinates(smooth[..., c], where, order=1, mode="nearest") for c in range(3)], axis=1
         )
-        usable = ((rgb > DARK) & (rgb < BRIGHT)).all(axis=1)
-        observed.append((of_point[rows][usable], np.full(usable.sum(), k), rgb[usable]))
+        observed.append((of_point[rows], np.full(len(rows), k), rgb))
     if not observed:
         return TrackColours(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
-    return TrackColours(*(np.concatenate(parts) for parts in zip(*observed)))
+    return TrackColours(*(np.concatenate(parts) for parts in zip(*observed))).usable()
 
 
 def log_gains(colours: TrackColours, views: int) -> np.ndarray:

@@ -298,6 +298,12 @@ class Pair:
         self.blocks = held_back(data, SEED)
         hidden = dataclasses.replace(scene, points=without_blocks(scene, self.blocks))
         self.data = dataclasses.replace(data, scene=hidden)
+        # Colours of held-back pixels do not say which points the start leaves out.
+        keeps = [
+            ~block if keep is None else (keep > 0.5) & ~block
+            for block, keep in zip(self.blocks, data.user_keep)
+        ]
+        self.first = MethodHooks().first_gaussians(dataclasses.replace(self.data, user_keep=keeps))
 
     def train(
         self,
@@ -317,7 +323,7 @@ class Pair:
         """
         policy = HeldBack(self.blocks, patches, masked)
         # "images" sets both pictures to zero in the blocks, so that no window of SSIM uses them
-        hooks = dataclasses.replace(MethodHooks(), mask=policy, density_config=FIXED, weighting="images")
+        hooks = MethodHooks(given=self.first, mask=policy, density_config=FIXED, weighting="images")
         config = TrainConfig(iterations=iterations, seed=SEED, probes=0, checkpoint_every_s=1e9)
         trainer = Trainer(self.data, with_effects(hooks, effects), config, folder=self.folder)
         train(trainer, tick=lambda _: tick())

@@ -7,7 +7,7 @@ through them: they show the surface behind, as other photos do. Training starts 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 MIN_TRACK = 3  # train photos that observe the points of which surfaces are made
 VIOLATED = 2  # photos whose free space a point must violate; one may have missed it
-AGREEING = 4  # a point stays if this many times as many photos show its colour at its place
+AGREEING = 4  # a point stays if this many times as many photos show it, or its colour at its place
 IN_FRONT = 0.9  # share of the surface's depth below which a point is in front of it
 EDGE = 0.3  # share of the photo's longer side; triangles with longer edges say nothing of colours
 SAME = 0.06  # mean difference of colours in [0, 1] up to which two are the same
-NEIGHBOURS, MOST_ASKED = 12, 60  # nearest other train photos that are asked about a place; of so many
+NEIGHBOURS = 12  # nearest other train photos that are asked about a place: farther ones confirm too much
 CONFIRM, CONFIRM_SHARE = 2, 0.3  # of these, so many must show the colour, and this share
 APART = 0.015  # share of the longer side; a photo that has point and place closer together is not asked
 PIXELS = 20_000  # of the reduced photos that colours are read from
@@ -60,7 +60,7 @@ def free_space_violations(data: TrainData) -> np.ndarray:
     of_point = _divide_by_gains(photos, cameras, observed, xyz)
     depths = nearest_depths(cameras, xyz, of_surface)
     centres = np.stack([camera.center for camera in cameras])
-    violated, agreeing = np.zeros((2, len(xyz)), np.int64)
+    violated, agreeing = np.zeros(len(xyz), np.int64), length.copy()  # who observes it shows it
     for view, camera in enumerate(cameras):
         pixels, z = camera.project(xyz)
         surface = _ObservedSurface.of(pixels[of_surface[view]], z[of_surface[view]])
@@ -78,23 +78,23 @@ def free_space_violations(data: TrainData) -> np.ndarray:
         agrees = _distance(shown, of_point[rows]) <= SAME
         behind = camera.unproject(pixels[rows], surface.depth(triangle, pixels[rows]))
         away = np.linalg.norm(centres - centres[view], axis=1)
-        nearest = [other for other in np.argsort(away, kind="stable") if other != view][:MOST_ASKED]
-        others = ((cameras[other], photos[other]) for other in nearest)
+        nearest = [other for other in np.argsort(away, kind="stable") if other != view][:NEIGHBOURS]
+        others = [(cameras[other], photos[other]) for other in nearest]
         violated[rows] += near | (small & ~agrees & _confirmed(behind, shown, xyz[rows], others))
         agreeing[rows] += small & agrees
     return (violated >= VIOLATED) & (AGREEING * violated > agreeing)
 
 
 def _confirmed(
-    behind: np.ndarray, shown: np.ndarray, points: np.ndarray, others: Iterable[tuple[Camera, _PhotoColours]]
+    behind: np.ndarray, shown: np.ndarray, points: np.ndarray, others: Sequence[tuple[Camera, _PhotoColours]]
 ) -> np.ndarray:
-    """Return whether enough of the first `NEIGHBOURS` photos that can tell show the same colour, [N] bool.
+    """Return whether enough of the photos that can tell show the same colour, [N] bool.
 
     Args:
         behind: [N, 3] places on the surface.
         shown: [N, 3] colours there.
         points: [N, 3] points in front of them.
-        others: cameras and colours of the other photos, in the order in which they are asked.
+        others: cameras and colours of the photos that are asked.
     """
     votes, answers = np.zeros((2, len(behind)), np.int64)
     for camera, photo in others:
@@ -195,11 +195,11 @@ def _divide_by_gains(
             for photo, camera, rows in zip(photos, cameras, observed, strict=True)
         ]
         view = np.repeat(np.arange(len(photos)), [len(rows) for rows in observed])
-        return TrackColours(np.concatenate(observed), view, np.concatenate(rgb)).usable()
+        return TrackColours(np.concatenate(observed), view, np.concatenate(rgb))
 
-    for photo, gain in zip(photos, np.exp(log_gains(read(), len(photos))), strict=True):
+    for photo, gain in zip(photos, np.exp(log_gains(read().usable(), len(photos))), strict=True):
         photo.gain = gain
-    colours = read()
+    colours = read().known()
     total, count = np.zeros((len(xyz), 3)), np.zeros((len(xyz), 1))
     np.add.at(total, colours.point, colours.rgb)
     np.add.at(count, colours.point, 1)

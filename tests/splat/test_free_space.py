@@ -207,7 +207,7 @@ def test_what_is_another_colour(difference, gone):
     assert left_out(data) == gone
 
 
-@pytest.mark.parametrize(("photos", "gone"), [(11, True), (12, False)])
+@pytest.mark.parametrize(("photos", "gone"), [(9, True), (10, False)])
 def test_four_times_as_many_photos_that_show_the_point_outweigh_the_others(photos, gone):
     at = [0.3 * k for k in range(photos)]  # photos 0 and 1 observe it, 2 and 3 see through it
     there = {k: RED for k in range(photos) if k not in (2, 3)}
@@ -225,14 +225,6 @@ def test_photos_that_have_point_and_place_closer_together_are_not_asked():
     # the last three stand at one place, and something hides the point from them
     data = capture(PLACE, (0, 1), at=[0, 1, 2, 2, 2])
     assert not left_out(draw(data, {0: RED, 1: RED, 2: GREEN, 3: GREEN, 4: GREEN}))
-
-
-@pytest.mark.parametrize("count", [4, 120])
-def test_a_path_of_many_photos_says_the_same(count):
-    at = np.linspace(0, 3, count)
-    observed = [k for k, x in enumerate(at) if x < 1.5]
-    data = capture(PLACE, observed[:2] if count == 4 else observed, at=at)
-    assert left_out(draw(data, dict.fromkeys(observed, RED)))
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.3])

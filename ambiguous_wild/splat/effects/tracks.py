@@ -23,8 +23,14 @@ class TrackColours:
 
     def usable(self) -> TrackColours:
         """Leave out what is black, clipped or unknown."""
-        some = ((self.rgb > DARK) & (self.rgb < BRIGHT)).all(axis=1)
-        return TrackColours(self.point[some], self.view[some], self.rgb[some])
+        return self._some(((self.rgb > DARK) & (self.rgb < BRIGHT)).all(axis=1))
+
+    def known(self) -> TrackColours:
+        """Leave out what is unknown, NaN."""
+        return self._some(np.isfinite(self.rgb).all(axis=1))
+
+    def _some(self, rows: np.ndarray) -> TrackColours:
+        return TrackColours(self.point[rows], self.view[rows], self.rgb[rows])
 
 
 def tracks_of(scene: Scene) -> list[np.ndarray]:

@@ -98,17 +98,13 @@ def _confirmed(
     """
     votes, answers = np.zeros((2, len(behind)), np.int64)
     for camera, photo in others:
-        rows = np.flatnonzero(answers < NEIGHBOURS)
-        if not len(rows):
-            break
-        pixels, z = camera.project(behind[rows])
-        beside = np.linalg.norm(pixels - camera.project(points[rows])[0], axis=1)
-        tells = camera.has(pixels, z) & ~(
-            beside <= APART * max(camera.width, camera.height)
-        )  # NaN: behind it
-        rows, colours = rows[tells], photo.at(pixels[tells])
-        answers[rows] += np.isfinite(colours).all(axis=1)
-        votes[rows] += _distance(colours, shown[rows]) <= SAME
+        pixels, z = camera.project(behind)
+        beside = np.linalg.norm(pixels - camera.project(points)[0], axis=1)
+        # NaN: the point is behind the camera
+        tells = camera.has(pixels, z) & ~(beside <= APART * max(camera.width, camera.height))
+        colours = photo.at(pixels[tells])
+        answers[tells] += np.isfinite(colours).all(axis=1)
+        votes[tells] += _distance(colours, shown[tells]) <= SAME
     return np.asarray(votes >= np.maximum(CONFIRM, CONFIRM_SHARE * answers))
 
 

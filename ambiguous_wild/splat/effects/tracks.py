@@ -23,11 +23,11 @@ class TrackColours:
 
     def usable(self) -> TrackColours:
         """Leave out what is black, clipped or unknown."""
-        return self._some(((self.rgb > DARK) & (self.rgb < BRIGHT)).all(axis=1))
+        return self._some(np.all((self.rgb > DARK) & (self.rgb < BRIGHT), axis=1))
 
     def known(self) -> TrackColours:
         """Leave out what is unknown, NaN."""
-        return self._some(np.isfinite(self.rgb).all(axis=1))
+        return self._some(np.all(np.isfinite(self.rgb), axis=1))
 
     def _some(self, rows: np.ndarray) -> TrackColours:
         return TrackColours(self.point[rows], self.view[rows], self.rgb[rows])

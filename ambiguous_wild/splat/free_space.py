@@ -51,8 +51,10 @@ def free_space_violations(data: TrainData) -> np.ndarray:
         _PhotoColours.of(photo, camera, keep)
         for photo, camera, keep in zip(data.photos, cameras, data.user_keep, strict=True)
     ]
-    inside = [camera.has(*camera.project(xyz)) for camera in cameras]
-    observed = [rows[within[rows]] for rows, within in zip(tracks_of(data.scene), inside, strict=True)]
+    observed = [
+        rows[camera.has(*camera.project(xyz[rows]))]
+        for camera, rows in zip(cameras, tracks_of(data.scene), strict=True)
+    ]
     length = np.bincount(np.concatenate([np.zeros(0, np.int64), *observed]), minlength=len(xyz))
     of_surface = [rows[length[rows] >= MIN_TRACK] for rows in observed]
     if not any(map(len, of_surface)):
@@ -66,8 +68,9 @@ def free_space_violations(data: TrainData) -> np.ndarray:
         surface = _ObservedSurface.of(pixels[of_surface[view]], z[of_surface[view]])
         if surface is None:
             continue
-        inside[view][observed[view]] = False
-        rows = np.flatnonzero(inside[view])
+        candidate = camera.has(pixels, z)
+        candidate[observed[view]] = False
+        rows = np.flatnonzero(candidate)
         triangle = surface.triangle(pixels[rows])
         least = surface.least_depth(triangle)
         shown = photos[view].at(pixels[rows])
@@ -184,20 +187,17 @@ def _divide_by_gains(
     xyz: np.ndarray,
 ) -> np.ndarray:
     """Set the gains of the photos; return the mean colour of each point [M, 3], NaN where none shows it."""
-
-    def read() -> TrackColours:
-        rgb = [
-            photo.at(camera.project(xyz[rows])[0])
-            for photo, camera, rows in zip(photos, cameras, observed, strict=True)
-        ]
-        view = np.repeat(np.arange(len(photos)), [len(rows) for rows in observed])
-        return TrackColours(np.concatenate(observed), view, np.concatenate(rgb))
-
-    for photo, gain in zip(photos, np.exp(log_gains(read().usable(), len(photos))), strict=True):
+    rgb = [
+        photo.at(camera.project(xyz[rows])[0])
+        for photo, camera, rows in zip(photos, cameras, observed, strict=True)
+    ]
+    view = np.repeat(np.arange(len(photos)), [len(rows) for rows in observed])
+    colours = TrackColours(np.concatenate(observed), view, np.concatenate(rgb)).known()
+    gains = np.exp(log_gains(colours.usable(), len(photos)))
+    for photo, gain in zip(photos, gains, strict=True):
         photo.gain = gain
-    colours = read().known()
     total, count = np.zeros((len(xyz), 3)), np.zeros((len(xyz), 1))
-    np.add.at(total, colours.point, colours.rgb)
+    np.add.at(total, colours.point, colours.rgb / gains[colours.view])
     np.add.at(count, colours.point, 1)
     return total / np.where(count > 0, count, np.nan)
 

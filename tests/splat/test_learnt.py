@@ -12,7 +12,7 @@ from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
 from ambiguous_wild.splat.effects.base import rate_for_run_length
-from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
+from ambiguous_wild.splat.effects.effect_pipeline import FIT_STEPS, EffectPipeline
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.render import render
@@ -129,6 +129,43 @@ def test_a_photo_that_was_not_trained_on(scene, tmp_path):
     assert error[0] < 0.7 * error[1]
     assert all(torch.equal(adam.values[: effect.photos], shared[name]) for name, adam in effect._adam.items())
     assert all(torch.equal(tensor, before[name]) for name, tensor in trainer.gaussians.named_tensors())
+
+
+class Gains(Learnt):
+    """A gain per photo; with `redraw` it also acts on the Gaussians' colours, without changing them."""
+
+    name = "gains"
+
+    def __init__(self, redraw: bool) -> None:
+        self.redraw = redraw
+
+    def acts(self, hook):
+        return super().acts(hook) or (hook == "shade" and self.redraw)
+
+    def leaves(self, data, rng):
+        return {"gain": Leaf(torch.zeros(len(data.photos), 3), rate=0.01, per_photo=True, fit_rate=0.02)}
+
+    def tone(self, image, alpha, leaf, context):
+        return image * (1 + leaf["gain"])
+
+
+def test_an_effect_on_the_picture_is_fitted_to_one_render(scene, tmp_path):
+    fits = []
+    for redraw in (True, False):
+        trainer = trainer_for(scene, tmp_path, Gains(redraw))
+        seen, draws = trainer.data.cameras[0], []
+
+        def draw(gaussians, context, shade, draws=draws):
+            draws.append(context)
+            return render(gaussians, context.camera, shade=shade)
+
+        photo = (trainer.render(seen).image * torch.tensor([1.3, 1.0, 0.7])).clamp(0, 1).detach()
+        context = trainer.context(seen, fitting=True)
+        keep = torch.ones(photo.shape[:2])
+        fits.append(trainer.effects.fit_view(trainer.gaussians, context, photo, keep, draw))
+        assert len(draws) == (1 + FIT_STEPS if redraw else 1)
+    assert torch.equal(*fits)
+    assert (fits[0] - photo).abs().mean() < 0.2 * (trainer.render(seen).image - photo).abs().mean()
 
 
 def test_names_are_told_apart(scene, tmp_path):

@@ -107,6 +107,12 @@ class Learnt(Effect):
         """Return copies of the leaves, to differentiate and to read after the optimiser's step."""
         return {name: self._row(name, context).detach().clone() for name in self._leaves}
 
+    def _learns(self, leaf: dict[str, Tensor], context: ViewContext) -> dict[str, Tensor]:
+        """Return the leaves to differentiate: of a test photo only its row."""
+        if not context.fitting:
+            return leaf
+        return {name: tensor for name, tensor in leaf.items() if self._leaves[name].per_photo}
+
     def _row(self, name: str, context: ViewContext) -> Tensor:
         values = self._adam[name].values
         if not self._leaves[name].per_photo:
@@ -129,7 +135,7 @@ class Learnt(Effect):
     def model(self, gaussians: Gaussians, context: ViewContext) -> tuple[Gaussians, Vjp]:
         leaf = self._leaf(context)
         given = {name: tensor.detach().clone() for name, tensor in gaussians.named_tensors()}
-        graph = _Graph(leaf, given)
+        graph = _Graph(self._learns(leaf, context), given)
         with torch.enable_grad():
             attributes = {name: given[name] for name in gaussians.attributes}
             inputs = Gaussians(*(given[name] for name in PARAMETERS), attributes=attributes)
@@ -160,7 +166,8 @@ class Learnt(Effect):
         leaf = self._leaf(context)
         attributes = {name: values[rows].detach() for name, values in gaussians.attributes.items()}
         means, base = gaussians.means[rows].detach(), base.detach()
-        graph = _Graph(leaf, {"base": base, "means": means}, attributes)
+        geometry = () if context.fitting else ({"means": means}, attributes)
+        graph = _Graph(self._learns(leaf, context), {"base": base}, *geometry)
         with torch.enable_grad():
             colours = self.forward(Visible(base, means, attributes), leaf, context)
 
@@ -178,7 +185,7 @@ class Learnt(Effect):
 
     def image(self, frame: Frame, context: ViewContext) -> tuple[Frame, FrameVjp]:
         leaf, image, alpha = self._leaf(context), frame.image.detach().clone(), frame.alpha.detach().clone()
-        graph = _Graph(leaf, {"image": image, "alpha": alpha})
+        graph = _Graph(self._learns(leaf, context), {"image": image, "alpha": alpha})
         with torch.enable_grad():
             toned = self.tone(image, alpha, leaf, context)
 

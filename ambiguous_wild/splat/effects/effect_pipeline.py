@@ -114,14 +114,8 @@ class EffectPipeline:
             return draw(gaussians, context, None)
         drawn, model_vjps = self.model(gaussians, context, without)
         rendered = draw(drawn, context, self._shade(drawn, context, without))
-        frame, frame_vjps = frame_of(rendered), []
-        for effect in self._with("image", without):
-            frame, vjp = effect.image(frame, context)
-            frame_vjps.append(vjp)
         posing = () if context.view is None else self._with("pose", without)
-        return EffectRender(
-            rendered, frame.image, frame.alpha, drawn, context, model_vjps, frame_vjps, posing
-        )
+        return EffectRender(rendered, drawn, context, model_vjps, self._with("image", without), posing)
 
     def _shade(self, drawn: Gaussians, context: ViewContext, without: Collection[str]) -> Shade | None:
         shading = self._with("shade", without)
@@ -170,17 +164,26 @@ class EffectPipeline:
         photo = torch.where(keep[..., None] > 0, photo, torch.zeros_like(photo))
         context = replace(context, photo=photo)
         fitted = self._with("fit")
+        if not fitted:
+            return self.render(gaussians, context, draw).image
         for effect in fitted:
             effect.begin_fit()
-        for _ in range(FIT_STEPS if fitted else 0):
-            rendered = self.render(gaussians, context, draw)
+        redraw = any(effect.acts(hook) for effect in fitted for hook in ("model", "shade"))
+        rendered = self.render(gaussians, context, draw)
+        for _ in range(FIT_STEPS):
+            assert isinstance(rendered, EffectRender)
             # "images" blanks both pictures outside of `keep`, so no window of SSIM reaches the other half
             loss = photometric(rendered.image, photo, keep, weighting="images")
-            effect_grads = rendered.backward(loss.d_image).effect_grads
+            through = rendered.backward if redraw else rendered.through_image_effects
+            effect_grads = through(loss.d_image).effect_grads
             for effect in fitted:
                 if effect.name in effect_grads:
                     effect.fit(effect_grads[effect.name])
-        return self.render(gaussians, context, draw).image
+            if redraw:
+                rendered = self.render(gaussians, context, draw)
+            else:
+                rendered.act_on_image()
+        return rendered.image
 
     def fitted(self) -> Facts:
         """Return the effects that `fit_view` fits to a test photo, its steps, and effects that read it."""
@@ -226,28 +229,42 @@ class EffectRender:
     def __init__(
         self,
         rendered: Rendered,
-        image: Tensor,
-        alpha: Tensor,
         drawn: Gaussians,
         context: ViewContext,
         model_vjps: Sequence[Vjp],
-        frame_vjps: Sequence[FrameVjp],
+        toning: Sequence[Effect],
         posing: Sequence[Effect],
     ) -> None:
         """
         Args:
             rendered: render of the back end.
-            image, alpha: pictures after the image effects.
             drawn: Gaussians that the back end drew.
             context: view context of the picture.
-            model_vjps, frame_vjps: vjps in the order in which the effects acted.
+            model_vjps: vjps in the order in which the effects acted.
+            toning: effects that act on the picture.
             posing: effects that learn from the camera's gradient.
         """
-        self.image, self.alpha = image, alpha
         self.visible = rendered.visible
         self.frames, self.renders = frames_of(rendered), renders_of(rendered)
         self._inner, self._drawn, self._context = rendered, drawn, context
-        self._model_vjps, self._frame_vjps, self._posing = model_vjps, frame_vjps, posing
+        self._model_vjps, self._toning, self._posing = model_vjps, toning, posing
+        self.act_on_image()
+
+    def act_on_image(self) -> None:
+        """Let the image effects act on the back end's picture, with the values that they have now."""
+        frame = frame_of(self._inner)
+        self._frame_vjps: list[FrameVjp] = []
+        for effect in self._toning:
+            frame, vjp = effect.image(frame, self._context)
+            self._frame_vjps.append(vjp)
+        self.image, self.alpha = frame.image, frame.alpha
+
+    def through_image_effects(self, cotangents: Cotangents | Tensor) -> Cotangents:
+        """Return the cotangents of the back end's pictures."""
+        passed = as_cotangents(cotangents)
+        for frame_vjp in reversed(self._frame_vjps):
+            passed = frame_vjp(passed)
+        return passed
 
     @property
     def depth(self) -> Tensor:
@@ -260,10 +277,7 @@ class EffectRender:
     @torch.no_grad()
     def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
         """Do as `Rendered.backward`; gradients of the effects' own parameters are in `effect_grads`."""
-        passed = as_cotangents(cotangents)
-        for frame_vjp in reversed(self._frame_vjps):
-            passed = frame_vjp(passed)
-        gradients = self._inner.backward(passed, needs)
+        gradients = self._inner.backward(self.through_image_effects(cotangents), needs)
         for effect in self._posing:
             gradients = gradients.with_effect_grads(
                 effect.name, effect.pose(self._drawn, gradients, self._context)

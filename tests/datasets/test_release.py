@@ -49,12 +49,14 @@ def jpeg_with_metadata(pixels):
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """An imported scene one of whose photos is a JPEG with metadata."""
+    """An imported scene, two of whose photos are JPEGs with metadata, the second called .jfif."""
     base = tmp_path_factory.mktemp("release")
     root = layouts.native(base / "raw")
-    name = layouts.TRAIN[0]
-    (root / "images" / name).unlink()
-    (root / "images" / f"{Path(name).stem}.jpg").write_bytes(jpeg_with_metadata(layouts.photo(0)))
+    for index, suffix in enumerate((".jpg", ".jfif")):
+        name = layouts.TRAIN[index]
+        (root / "images" / name).unlink()
+        jpeg = jpeg_with_metadata(layouts.photo(index))
+        (root / "images" / f"{Path(name).stem}{suffix}").write_bytes(jpeg)
     scene = import_scene(root, base / "toy").scene
     info = json.loads((scene / "scene.json").read_text())
     score = {"value": 0.41, "low": 0.35, "high": 0.47}
@@ -226,10 +228,13 @@ def test_nothing_of_the_users_is_replaced(scene, package, tmp_path):
         package_scenes([scene], scene / "package", INFO, look_for_people=False)
     copy = tmp_path / "package"
     shutil.copytree(package, copy)
-    (copy / "notes.txt").write_text("mine")
-    with pytest.raises(AwError, match=r"notes\.txt"):
-        package_scenes([scene], copy, INFO, look_for_people=False)
-    assert (copy / "notes.txt").read_text() == "mine"
+    for name in ("notes.txt", "mine.zip"):
+        (copy / name).write_text("mine")
+        with pytest.raises(AwError, match=f"also holds {name}"):
+            package_scenes([scene], copy, INFO, look_for_people=False)
+        assert (copy / name).read_text() == "mine"
+        (copy / name).unlink()
+    assert package_scenes([scene], copy, INFO, look_for_people=False).stripped == 2
 
 
 def test_a_plain_scene_must_be_imported_first(tmp_path):

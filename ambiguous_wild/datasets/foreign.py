@@ -35,6 +35,16 @@ class ForeignScene:
     points: Literal["model", "triangulate", "random"] = "model"  # source of the initial points
     notes: tuple[str, ...] = ()  # decisions and omissions, for the user
 
+    @property
+    def only_small(self) -> bool:
+        """Whether the dataset has downsampled photos only."""
+        return not self.photos.is_dir()
+
+    @property
+    def photo_folder(self) -> Path:
+        """The folder of the photos that are read: full-size ones, if there are any."""
+        return self.root / f"images_{self.factor}" if self.only_small else self.photos
+
 
 def inside(name: str, root: Path) -> str:
     """Return a relative name of the dataset after checking that it stays below its folder.

@@ -69,8 +69,7 @@ def at_photo_size(scene: ForeignScene) -> tuple[ForeignScene, float]:
     Returns:
         The scene, and how many times smaller than their cameras the photos are: the median; 1 = same size.
     """
-    folder = scene.photos if scene.photos.is_dir() else scene.root / f"images_{scene.factor}"
-    cameras, taken = dict(scene.model.cameras), dict[tuple[int, int, int], int]()
+    folder, cameras, taken = scene.photo_folder, dict(scene.model.cameras), dict[tuple[int, int, int], int]()
     images, ratios = {}, []
     for number, image in scene.model.images.items():
         images[number] = image
@@ -100,8 +99,7 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
     Raises:
         AwError: photos are absent, are no images, or have another shape than their cameras.
     """
-    only_small = not scene.photos.is_dir()
-    folder = scene.root / f"images_{scene.factor}" if only_small else scene.photos
+    folder, only_small = scene.photo_folder, scene.only_small
     absent, wrong, plans = [], [], []
     for image in sorted(scene.model.images.values(), key=lambda i: i.name):
         if image.name not in scene.split:
@@ -319,8 +317,9 @@ def _read(path: Path, background: tuple[int, int, int] | None) -> np.ndarray:
     if background is None:
         return read_png_rgb(path)
     data = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-    if data is None or data.dtype != np.uint8 or data.ndim != 3 or data.shape[2] != 4:
+    if data is None or data.dtype not in (np.uint8, np.uint16) or data.ndim != 3 or data.shape[2] != 4:
         return read_png_rgb(path)
+    data = data // 257 if data.dtype == np.uint16 else data
     alpha = data[..., 3:].astype(np.float32) / 255
     rgb = data[..., 2::-1].astype(np.float32)
     behind = np.array(background, np.float32) * (1 - alpha)

@@ -135,12 +135,13 @@ def triangulate(
 
 
 def find_motion(
-    scene: Path, scratch: Path, train: Sequence[str], *, seed: int, jobs: int, bar: Bar
+    scene: Path, images: str, scratch: Path, train: Sequence[str], *, seed: int, jobs: int, bar: Bar
 ) -> MotionResult:
     """Match the train photos of a scene folder and write their motion points (motion.npz) into it.
 
     Args:
-        scene: folder with images/ and sparse/0, undistorted.
+        scene: folder with the photos and sparse/0, undistorted.
+        images: its folder of the photos at the size of the cameras.
         scratch: folder for COLMAP's files; emptied first.
         train: names of the photos.
         seed: seed of matching.
@@ -156,7 +157,7 @@ def find_motion(
     shutil.rmtree(scratch, ignore_errors=True)
     model = read_model(scene / "sparse" / "0")
     split: dict[str, Split] = dict.fromkeys(train, "train")
-    database = _match_posed(scratch, model, scene / "images", split, "auto", seed, jobs, bar)
+    database = _match_posed(scratch, model, scene / images, split, "auto", seed, jobs, bar)
     job: RelativePoseJob = {
         "task": "relative_poses",
         "database": str(database),
@@ -175,7 +176,7 @@ def find_motion(
         scratch / RELATIVE_POSES,
         known,
         scene / "sparse" / "0",
-        scene / "images",
+        scene / images,
         train,
         jobs,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import glob
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.resample import check_factor
 from ambiguous_wild.builder.scene_package import list_files, nerfbaselines_info
 from ambiguous_wild.builder.scene_record import point_checks, unfit_warnings
+from ambiguous_wild.builder.sfm import SfmCrash
 from ambiguous_wild.builder.workspace import content_key, versions
 from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.core.machine import photo_threads
@@ -157,6 +159,8 @@ def import_scene(
         largest = max(plan.camera.width * plan.camera.height for plan in plans)
         try:
             _write_scene(work, foreign, plans, settings, name, key, jobs or photo_threads(largest), bar)
+        except SfmCrash:  # its log is in the work folder
+            raise
         except AwError as error:
             shutil.rmtree(work, ignore_errors=True)
             error.args = (str(error).replace(str(work / "scene"), str(root)),)  # what the user knows
@@ -164,7 +168,7 @@ def import_scene(
         finally:
             bar.finish()
         replace_folder(work / "scene", target)
-        for left in target.parent.glob(f".{target.name}.import-*"):
+        for left in target.parent.glob(f".{glob.escape(target.name)}.import-*"):
             shutil.rmtree(left, ignore_errors=True)
     info = json.loads((target / "scene.json").read_text(encoding="utf-8"))
     return ImportResult(target, info, why, False)
@@ -172,19 +176,20 @@ def import_scene(
 
 def _at_photo_size(foreign: ForeignScene, settings: ImportSettings) -> ForeignScene:
     """Return the scene with cameras at the size of its photos, and with the factor that then remains."""
-    alone = not foreign.photos.is_dir()  # there is images_N without images/, so N must stay
+    alone = foreign.only_small
+    if alone and settings.factor is not None:
+        foreign = dataclasses.replace(foreign, factor=settings.factor)  # chooses which photos are read
     foreign, times = at_photo_size(foreign)
-    if times > LARGER and not alone:
+    if times > LARGER and not alone:  # images_N without images/ stays N
         # The published factor refers to the cameras; photos that were reduced before are not reduced again.
         note = f"photos are {times:.3g} times smaller than the model's cameras: intrinsics are scaled to them"
         factor = max(1, round(foreign.factor / times))
         foreign = dataclasses.replace(foreign, factor=factor, notes=(*foreign.notes, note))
-    if settings.factor is None:
+    if settings.factor is None or alone:
         return foreign
-    if not alone:
-        cameras, images = foreign.model.cameras, foreign.model.images.values()
-        sizes = ((cameras[i.camera_id], i.name) for i in images)
-        check_factor(settings.factor, [(min(c.width, c.height), name) for c, name in sizes])
+    cameras, images = foreign.model.cameras, foreign.model.images.values()
+    sizes = ((cameras[i.camera_id], i.name) for i in images)
+    check_factor(settings.factor, [(min(c.width, c.height), name) for c, name in sizes])
     return dataclasses.replace(foreign, factor=settings.factor)
 
 
@@ -198,15 +203,21 @@ def _key(foreign: ForeignScene, plans: list[PhotoPlan], settings: ImportSettings
     split = sorted(foreign.split.items())
     kept = dataclasses.asdict(settings) | {"factor": foreign.factor, "name": name, "kind": foreign.kind}
     points = [len(model.points.ids), float(model.points.xyz.sum()), foreign.points]
-    return content_key(versions(), states, cameras, poses, split, kept, points)
+    # Other layouts imply both.
+    stated = [[foreign.evaluation, foreign.dataset]] if foreign.kind == "nerfbaselines" else []
+    return content_key(versions(), states, cameras, poses, split, kept, points, *stated)
 
 
 def _existing(target: Path, key: str, overwrite: bool) -> ImportRecord | None:
     info = read_scene_json(target)
     if info is not None and info.get("build_key") == key:
-        verify_files(target, info, quick=True)
-        return cast(ImportRecord, info)  # the key shows that this code wrote it
-    if info is not None and not overwrite:
+        try:
+            verify_files(target, info, quick=True)
+            return cast(ImportRecord, info)  # the key shows that this code wrote it
+        except AwError:
+            if not overwrite:
+                raise
+    elif info is not None and not overwrite:
         raise AwError(
             f"{target} exists, from other files or settings; pass --overwrite to replace it, or "
             "choose another -o"
@@ -262,7 +273,8 @@ def _write_scene(
     scene_model = _write_model(folder, model, placed)
     if settings.motion:
         train = sorted(n for n, s in sides.items() if s == "train")
-        motion = find_motion(folder, work / "motion", train, seed=settings.seed, jobs=jobs, bar=bar)
+        images = f"images_{foreign.factor}" if foreign.only_small else "images"
+        motion = find_motion(folder, images, work / "motion", train, seed=settings.seed, jobs=jobs, bar=bar)
         notes.append(f"{motion['static']} features of train photos are static, {motion['moving']} move")
         notes += unfit_warnings(motion["unfit"])
     for side in SIDES:
@@ -286,7 +298,7 @@ def _with_points(
         scratch = work / "points"
         shutil.rmtree(scratch, ignore_errors=True)
         model = triangulate(
-            scratch, model, foreign.photos, foreign.split, seed=settings.seed, jobs=jobs, bar=bar
+            scratch, model, foreign.photo_folder, foreign.split, seed=settings.seed, jobs=jobs, bar=bar
         )
         if not len(model.points.ids):
             notes.append("too few points could be triangulated: initial points are random")
@@ -336,7 +348,7 @@ def _record(
         for side, names in foreign.missing.items()
         if names
     ]
-    divisor = foreign.factor if foreign.photos.is_dir() else 1
+    divisor = 1 if foreign.only_small else foreign.factor
     size = min(((p.camera.width // divisor, p.camera.height // divisor) for p in placed), key=min)
     if min(size) < SMALL_SIDE:
         warnings.append(

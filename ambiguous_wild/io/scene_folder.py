@@ -190,10 +190,11 @@ def verify_files(root: Path | str, info: SceneInfo, *, quick: bool = False) -> N
         elif path.stat().st_size != known["bytes"] or (not quick and sha256_file(path) != known["sha256"]):
             wrong.append(f"{name} (changed)")
     if wrong:
+        command = "import DATASET" if "imported" in info else "build-scene PHOTOS"
         raise AwError(
             f"{len(wrong)} of {len(files)} files of {base} differ from what scene.json recorded: "
             f"{shortlist(wrong)}; restore them, or build the scene again with "
-            "'aw build-scene PHOTOS -o SCENE --overwrite'"
+            f"'aw {command} -o SCENE --overwrite'"
         )
 
 

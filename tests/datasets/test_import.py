@@ -5,10 +5,12 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from ambiguous_wild.builder.resample import downsample_photo
+from ambiguous_wild.builder.sfm import SfmCrash
 from ambiguous_wild.cli import bench
 from ambiguous_wild.cli import datasets as import_dataset
 from ambiguous_wild.core import AwError
@@ -114,6 +116,20 @@ def test_downsampled_photos_alone_are_enough(tmp_path):
     assert (scene.views[0].camera.width, scene.views[0].camera.height) == (8, 4)
 
 
+def test_of_several_downsampled_sizes_the_one_of_the_factor_is_read(tmp_path):
+    root, native = layouts.native(tmp_path / "raw"), load_scene(layouts.native(tmp_path / "native"))
+    for factor in (2, 4):
+        (root / f"images_{factor}").mkdir()
+        for path in (root / "images").iterdir():
+            write_png(root / f"images_{factor}" / path.name, read_png_rgb(path)[::factor, ::factor].copy())
+    shutil.rmtree(root / "images")
+    for factor in (2, 4):
+        done = import_scene(root, tmp_path / "scene", ImportSettings(factor=factor), overwrite=True)
+        scene = load_scene(done.scene)
+        assert scene.views[0].camera.width == layouts.WIDTH // factor
+        assert np.allclose(scene.points.track_xy, native.points.track_xy / factor, atol=1e-3)
+
+
 def test_blender_has_white_behind_and_the_field_of_view(native, imported):
     scene = load_scene(imported("blender")[1].scene)
     assert [v.split for v in scene.views] == ["test"] * 2 + ["train"] * 5  # test/... sorts before train/...
@@ -126,6 +142,17 @@ def test_blender_has_white_behind_and_the_field_of_view(native, imported):
         assert np.array_equal(pixels, wanted)
         assert np.isclose(other.camera.fx, layouts.FX) and other.camera.cx == layouts.WIDTH / 2
     assert len(scene.points) == 100_000 and np.abs(scene.points.xyz).max() <= 1.3
+
+
+def test_blender_photos_of_16_bits_keep_their_alpha(native, tmp_path):
+    root = layouts.blender(tmp_path / "raw")
+    for path in root.rglob("*.png"):
+        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.uint16) * 257
+        path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+    for view in load_scene(import_scene(root, tmp_path / "scene").scene).views:
+        wanted = read_png_rgb(native.root / "images" / Path(view.name).name).copy()
+        wanted[:4, :4] = 255
+        assert np.array_equal(read_png_rgb(view.image_path), wanted)
 
 
 def test_lens_distortion_is_taken_out(tmp_path):
@@ -205,6 +232,43 @@ def test_the_same_import_again_does_nothing_and_another_is_refused(imported, tmp
     again = import_scene(root, tmp_path / "scene", ImportSettings(factor=2), overwrite=True)
     assert again.info["factor"] == 2
     assert sorted(p.name for p in tmp_path.iterdir()) == ["raw", "scene"]
+
+
+def test_another_protocol_is_another_import(tmp_path):
+    root = layouts.nerfbaselines(tmp_path / "raw")
+    import_scene(root, tmp_path / "scene")
+    info = json.loads((root / "nb-info.json").read_text())
+    (root / "nb-info.json").write_text(json.dumps({**info, "evaluation_protocol": "nerfw"}))
+    again = import_scene(root, tmp_path / "scene", overwrite=True)
+    assert not again.up_to_date and again.info["evaluation"]["protocol"] == "half"
+
+
+def test_a_damaged_import_is_repaired_on_request(tmp_path):
+    root = layouts.native(tmp_path / "raw")
+    photo = import_scene(root, tmp_path / "scene").scene / "images" / layouts.TRAIN[0]
+    photo.unlink()
+    with pytest.raises(AwError, match="'aw import DATASET -o SCENE --overwrite'"):
+        import_scene(root, tmp_path / "scene")
+    assert not import_scene(root, tmp_path / "scene", overwrite=True).up_to_date and photo.is_file()
+
+
+def test_an_import_leaves_the_unfinished_ones_of_other_names(tmp_path):
+    other = tmp_path / ".scene1.import-0123456789abcdef"
+    other.mkdir()
+    import_scene(layouts.native(tmp_path / "raw"), tmp_path / "scene[12]", ImportSettings(name="scene"))
+    assert other.is_dir()
+
+
+def test_a_crash_of_colmap_keeps_its_log(monkeypatch, tmp_path):
+    def crash(folder, images, scratch, *args, **kwargs):
+        scratch.mkdir()
+        (scratch / "colmap.log").write_text("the reason")
+        raise SfmCrash(f"log: {scratch / 'colmap.log'}")
+
+    monkeypatch.setattr("ambiguous_wild.datasets.write.find_motion", crash)
+    with pytest.raises(SfmCrash) as error:
+        import_scene(layouts.native(tmp_path / "raw"), tmp_path / "scene", ImportSettings(motion=True))
+    assert Path(str(error.value).removeprefix("log: ")).read_text() == "the reason"
 
 
 def test_what_is_trained_on_has_the_bits_of_the_native_scene(native, imported):

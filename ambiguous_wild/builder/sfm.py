@@ -236,8 +236,8 @@ class StructureFromMotion:
         lost = [photo.source for photo in self.photos if photo.name not in features]
         if lost:
             raise SfmCrash(
-                f"COLMAP dropped {len(lost)} photos without a message, the first is {lost[0]}; its log is in "
-                "the work folder that --keep-work leaves"
+                f"COLMAP dropped {len(lost)} photos without a message, the first is {lost[0]} "
+                f"(log: {_kept_log(folder)})"
             )
         return {"camera": camera, "features": features}
 
@@ -370,12 +370,15 @@ def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
                 process.wait()
     work.unlink()
     if code != 0:
-        kept = folder.parent / LOG
-        shutil.copyfile(log, kept)
         raise SfmCrash(
-            f"COLMAP ended with code {code} while computing {job['task']}: {_last_line(log)} (log: {kept}); "
-            "run the same command again: it continues before this step"
+            f"COLMAP ended with code {code} while computing {job['task']}: {_last_line(log)} "
+            f"(log: {_kept_log(folder)}); run the same command again: it continues before this step"
         )
+
+
+def _kept_log(folder: Path) -> Path:
+    """Copy the log beside the stage's folder, which is removed after an error."""
+    return Path(shutil.copyfile(folder / LOG, folder.parent / LOG))
 
 
 def _last_line(log: Path) -> str:

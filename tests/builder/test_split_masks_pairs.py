@@ -5,13 +5,16 @@ import pytest
 from PIL import Image
 
 from ambiguous_wild.builder.keep_masks import find_masks, lay_out_masks, mask_warnings
+from ambiguous_wild.builder.matched import Matched
+from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.retrieval import sequential_pairs
 from ambiguous_wild.builder.settings import BuildSettings, plans
-from ambiguous_wild.builder.sfm import camera_groups, choose_camera
+from ambiguous_wild.builder.sfm import DATABASE, StructureFromMotion, camera_groups, choose_camera
 from ambiguous_wild.builder.stages import read_test_list, split_photos
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import read_gray, write_png
+from tests.builder.capture_maker import write_capture
 
 
 def photos_of(count=10, sides=None):
@@ -149,6 +152,22 @@ def test_a_test_photo_meets_every_training_photo():
     assert frozenset(("w0", "w32")) in joined
     assert frozenset(("w0", "w11")) not in joined
     assert len(pairs) < 60 * 59 / 2
+
+
+def test_names_with_blanks_are_matched_too(tmp_path):
+    photos = [
+        ScreenedPhoto(source=path.name, name=path.name) for path in write_capture(tmp_path / "raw", 3, "a b ")
+    ]
+    settings = BuildSettings(matcher="sequential")
+    job = StructureFromMotion(
+        photos, tmp_path / "raw", settings, plans(photos, settings)[0], 1, Bar(enabled=False)
+    )
+    for stage in ("features", "matches"):
+        (tmp_path / stage).mkdir()
+    job.extract_features(tmp_path / "features", "single")
+    assert job.match(tmp_path / "matches", tmp_path / "features", posed=True)["pairs"] == 3
+    matched = Matched.read(tmp_path / "matches" / DATABASE)
+    assert matched.names == [photo.name for photo in photos] and len(matched.matches) == 3
 
 
 def test_one_camera_only_where_everything_agrees():

@@ -7,11 +7,11 @@ members of one name, and archive bombs. Sizes are counted while writing, never t
 from __future__ import annotations
 
 import bz2
+import glob
 import gzip
 import io
 import stat
 import tarfile
-import unicodedata
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.names import quoted
+from ambiguous_wild.core.names import quoted, spelling_key
 from ambiguous_wild.io.files import atomic_dir, is_free
 
 _CHUNK = 1 << 20
@@ -95,7 +95,8 @@ def unpack(
         target = _UnpackFolder(name, packed, limits or Limits(), folder, wanted)
         opened = open(source, "rb") if isinstance(source, Path) else io.BytesIO(source)  # noqa: SIM115
         with opened as raw, _named_errors(name):
-            members = _zip_members if zipfile.is_zipfile(raw) else _tar_members
+            # `is_zipfile` takes a tar for the zip that it ends with.
+            members = _zip_members if raw.read(4) in (b"PK\3\4", b"PK\5\6") else _tar_members
             raw.seek(0)
             for member, data in members(raw, name):
                 target.add(member, data)
@@ -117,8 +118,9 @@ def pack_folder(folder: Path | str, limit_mb: float) -> bytes:
         AwError: the files are larger.
     """
     root = Path(folder)
-    # Names that begin with a dot are locks, caches and unfinished files.
-    paths = [p for p in sorted(root.rglob("*")) if p.is_file() and not _hidden(p.relative_to(root))]
+    # Names that begin with a dot, which glob leaves out, are locks, caches and unfinished files.
+    below = sorted(root / name for name in glob.iglob("**", root_dir=root, recursive=True))
+    paths = [path for path in below if path.is_file()]
     size_mb = sum(p.stat().st_size for p in paths) / 1e6
     if size_mb > limit_mb:
         raise AwError(
@@ -130,10 +132,6 @@ def pack_folder(folder: Path | str, limit_mb: float) -> bytes:
         for path in paths:
             archive.add(path, path.relative_to(root).as_posix(), recursive=False)
     return buffer.getvalue()
-
-
-def _hidden(relative: Path) -> bool:
-    return any(part.startswith(".") for part in relative.parts)
 
 
 @contextmanager
@@ -184,7 +182,7 @@ class _UnpackFolder:
         if len(self.names) >= self.files:
             raise AwError(f"{self.archive} holds more than {self.files} files; unpack a part of it")
         # Some file systems take two such names for one file, and one would overwrite the other.
-        key = unicodedata.normalize("NFC", str(path)).casefold()
+        key = spelling_key(str(path))
         if key in self.names:
             raise AwError(
                 f"{self.archive} holds {quoted(name)} and {quoted(self.names[key])}, the same file; "

@@ -301,8 +301,10 @@ def replace_folder(source: Path, target: Path) -> None:
         return
     old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old-", dir=target.parent))
     os.replace(target, old / target.name)
-    os.replace(source, target)
-    shutil.rmtree(old)
+    try:
+        os.replace(source, target)
+    finally:
+        _remove_left(old)
 
 
 def refuse_file(path: Path | str) -> None:
@@ -315,7 +317,15 @@ def sweep(folder: Path | str) -> None:
     """Remove temporary files of killed processes; call it only with the folder locked."""
     for left in sorted(Path(folder).rglob(".*")):
         if _TEMPORARY.fullmatch(left.name):
-            remove(left)
+            _remove_left(left)
+
+
+def _remove_left(left: Path) -> None:
+    """Remove what a call left; a folder that `replace_folder` took away and did not replace goes back."""
+    for old in left.glob("*") if left.name[:-8].endswith(".old-") else ():
+        if not os.path.lexists(left.parent / old.name):
+            os.replace(old, left.parent / old.name)
+    remove(left)
 
 
 def remove(path: Path) -> None:
@@ -346,7 +356,7 @@ def sweep_siblings(path: Path | str) -> None:
     name = glob.escape(target.name)
     for pattern in (f".{name}.tmp-*", f".{name}.old-*"):
         for left in sorted(target.parent.glob(pattern)):
-            shutil.rmtree(left, ignore_errors=True)
+            _remove_left(left)
 
 
 def check_output(path: Path | str, *, outside: Mapping[str, Path] | None = None, new: bool = False) -> Path:

@@ -95,6 +95,11 @@ def test_what_is_whole_comes_out(tmp_path, kind):
     assert sorted(os.listdir(tmp_path)) == ["download", "out"]
 
 
+def test_a_tar_that_ends_with_a_zip_is_a_tar(tmp_path):
+    (tmp_path / "download").write_bytes(tar_of(("a.txt", b"a"), ("masks.zip", WHOLE["zip"])))
+    assert extract(tmp_path / "download", tmp_path / "out") == ["a.txt", "masks.zip"]
+
+
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_what_is_hostile_or_damaged_leaves_nothing(tmp_path, kind):
     data, reason = HOSTILE[kind]
@@ -151,15 +156,19 @@ def test_a_folder_comes_back_as_it_was_without_what_is_hidden(tmp_path):
         path.write_bytes(name.encode())
     (tmp_path / "real.txt").write_text("behind a link")
     (source / "link.txt").symlink_to(tmp_path / "real.txt")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "p.jpg").write_text("of a linked folder")
+    (source / "images").symlink_to(tmp_path / "photos")
     target.mkdir()
     names = unpack(pack_folder(source, 1.0), target, SMALL)
     assert tree(target) == {
         "x.txt": b"x.txt",
         "deep/er/y.bin": b"deep/er/y.bin",
         "link.txt": b"behind a link",
+        "images/p.jpg": b"of a linked folder",
     }
     assert sorted(names) == sorted(tree(target))
-    assert not (target / "link.txt").is_symlink()
+    assert not (target / "link.txt").is_symlink() and not (target / "images").is_symlink()
 
 
 def test_too_much_is_refused_both_ways(tmp_path):

@@ -18,8 +18,10 @@ from ambiguous_wild.io.files import (
     atomic_path,
     check_output,
     folder_lock,
+    replace_folder,
     sweep,
     sweep_killed,
+    sweep_siblings,
     write_json,
     write_text,
 )
@@ -126,6 +128,19 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(tmp_path):
     assert len(list(tmp_path.iterdir())) == 4
     sweep(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".hidden", "mine.txt"]
+
+
+def test_a_folder_that_was_not_replaced_goes_back(tmp_path):
+    with atomic_dir(tmp_path / "d") as temporary:
+        (temporary / "x").touch()
+    with pytest.raises(FileNotFoundError):
+        replace_folder(tmp_path / "nothing", tmp_path / "d")
+    assert [path.name for path in tmp_path.rglob("*")] == ["d", "x"]
+    for clear in (lambda: sweep(tmp_path), lambda: sweep_siblings(tmp_path / "d")):
+        (tmp_path / ".d.old-abcd1234").mkdir()
+        (tmp_path / "d").rename(tmp_path / ".d.old-abcd1234" / "d")  # as a kill between the renames leaves it
+        clear()
+        assert [path.name for path in tmp_path.rglob("*")] == ["d", "x"]
 
 
 def test_a_link_stays_and_its_target_is_written(tmp_path):

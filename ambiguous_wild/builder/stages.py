@@ -122,7 +122,7 @@ class Stages:
         capture, settings, inputs = self.capture, self.settings, self.inputs
         screened = work.run(
             "screen",
-            [inputs["versions"], inputs["photos"], settings.strict],
+            [inputs["versions"], inputs["photos"], settings.strict, str(capture.root)],  # it links the photos
             lambda f: screen(capture, f, strict=settings.strict, jobs=self.jobs, bar=self.bar),
         )
         photos = [ScreenedPhoto(**fields) for fields in screened.facts["photos"]]

@@ -48,7 +48,7 @@ def scene(built):
 def copy_of(built: Path, out: Path) -> Path:
     """The scene with the finished stages of its build, to go on from."""
     shutil.copytree(built / "scene", out)
-    shutil.copytree(built / ".scene.build", out.with_name(f".{out.name}.build"))
+    shutil.copytree(built / ".scene.build", out.with_name(f".{out.name}.build"), symlinks=True)
     return out
 
 
@@ -290,6 +290,15 @@ def test_a_full_disk_keeps_what_is_done_and_goes_on(built, raw, scene, tmp_path,
     result = build_scene(raw, tmp_path / "scene", SETTINGS)
     assert set(result.reused) == {"screen", "features", "matches", "mapping", "motion", "map"}
     assert hashes(result.scene) == hashes(scene)
+
+
+def test_a_capture_that_was_moved_is_linked_anew(built, raw, tmp_path):
+    out = copy_of(built, tmp_path / "scene")
+    shutil.rmtree(out)
+    shutil.copytree(raw, tmp_path / "moved")
+    build_scene(tmp_path / "moved", out, SETTINGS, keep_work=True)
+    links = [path for path in (tmp_path / ".scene.build").glob("screen-*/photos/*.png") if path.is_symlink()]
+    assert {path.resolve().is_relative_to(tmp_path) for path in links} == {True, False}
 
 
 def test_a_mistyped_option_does_not_cost_the_work_of_a_stopped_build(built, raw, tmp_path):

@@ -375,7 +375,7 @@ def _with_left_out(
         for lost, covisible in ((a, b), (b, a)):
             if lost in left_out and covisible in at and matches > best.get(lost, (0, ""))[0]:
                 best[lost] = int(matches), covisible
-        middle = np.median([photo.xy for photo in drawn.photos], axis=0)
+    middle = np.median([photo.xy for photo in drawn.photos], axis=0)
     low, high = frame_limits(np.array([photo.xy for photo in drawn.photos]))
     likely = {name: plane @ np.array(xyz, float) for name, xyz in mapping["hypotheses"].items()}
     # A hypothesis far from all registered photos is wrong more often than not.

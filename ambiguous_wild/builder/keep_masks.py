@@ -23,6 +23,7 @@ from ambiguous_wild.io.images import (
     upright,
     write_png,
 )
+from ambiguous_wild.io.mask_files import SPELLINGS
 from ambiguous_wild.io.mask_files import find_masks as by_name
 from ambiguous_wild.io.photos import TRANSPARENT
 
@@ -64,9 +65,10 @@ def find_masks(folder: Path, photos: Sequence[ScreenedPhoto], missing: str) -> d
             f"{shortlist(misfits, 3)}; resize them with nearest-neighbour sampling"
         )
     if unmasked and (missing == "error" or not mask_files):
+        how = " as NAME.png, or pass --masks-missing keep to use those photos whole"
         raise AwError(
             f"{len(unmasked)} of {len(photos)} photos have no mask: {shortlist(unmasked)}; add them under "
-            f"{folder} as NAME.png, or pass --masks-missing keep to use those photos whole"
+            f"{folder}{how if mask_files else f': {SPELLINGS}'}"
         )
     return mask_files
 

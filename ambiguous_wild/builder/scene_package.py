@@ -58,7 +58,8 @@ def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool,
         _add_file(path, folder / path.name, link=link)
     (folder / "train_list.txt").write_text("".join(f"{n}\n" for n in parts.train), encoding="utf-8")
     (folder / "test_list.txt").write_text("".join(f"{n}\n" for n in parts.test), encoding="utf-8")
-    write_json(folder / "nb-info.json", nerfbaselines_info(parts.factor, record["name"]))
+    half = record.get("evaluation", {}).get("protocol") == "half"
+    write_json(folder / "nb-info.json", nerfbaselines_info(parts.factor, record["name"], half=half))
     files = list_files(folder, jobs)
     scene: SceneRecord = {
         "schema": "ambiguous_wild.scene",
@@ -71,8 +72,10 @@ def package(folder: Path, parts: SceneParts, record: KeyedRecord, *, link: bool,
     return {"files": len(files) + 1, "bytes": sum(f["bytes"] for f in files.values())}
 
 
-def nerfbaselines_info(factor: int, name: str) -> dict[str, object]:
+def nerfbaselines_info(factor: int, name: str, *, half: bool) -> dict[str, object]:
     """Return nb-info.json: the folder that NerfBaselines loads, and its evaluation protocol.
+
+    `half`: the right half of each test photo is measured.
 
     No `id`: NerfBaselines only loads ids that are registered with it.
     """
@@ -80,7 +83,7 @@ def nerfbaselines_info(factor: int, name: str) -> dict[str, object]:
         "loader": "colmap",
         "loader_kwargs": {"images_path": "images" if factor == 1 else f"images_{factor}"},
         "scene": name,
-        "evaluation_protocol": "default",
+        "evaluation_protocol": "nerfw" if half else "default",
         "downscale_factor": factor,
     }
 

@@ -146,8 +146,7 @@ def _nerfbaselines(scene: Scene, folder: Path, put: CopyOrLink) -> list[str]:
             target = folder / "masks" / f"{without_suffix(view.name)}.png"
             if not target.is_file():
                 write_png(target, np.full((view.camera.height, view.camera.width), 255, np.uint8))
-    protocol = {"evaluation_protocol": "nerfw"} if _half(scene) else {}
-    write_json(folder / "nb-info.json", nerfbaselines_info(1, scene.name) | protocol)
+    write_json(folder / "nb-info.json", nerfbaselines_info(1, scene.name, half=_half(scene)))
     return []
 
 

@@ -280,8 +280,8 @@ def _write_scene(
     for side in SIDES:
         lines = sorted(n for n, s in sides.items() if s == side)
         write_text(folder / f"{side}_list.txt", "".join(f"{n}\n" for n in lines))
-    protocol = {"evaluation_protocol": "nerfw"} if foreign.evaluation.get("protocol") == "half" else {}
-    write_json(folder / "nb-info.json", nerfbaselines_info(foreign.factor, name) | protocol)
+    half = foreign.evaluation.get("protocol") == "half"
+    write_json(folder / "nb-info.json", nerfbaselines_info(foreign.factor, name, half=half))
     record = _record(foreign, settings, name, sides, scene_model, placed, notes, key)
     sweep(folder)  # remove temporary files of killed calls
     record["files"] = list_files(folder, jobs)

@@ -84,6 +84,7 @@ def test_a_scene_carries_its_protocol_and_the_shadows_of_its_distractors(tmp_pat
     simulate(spec, tmp_path / "raw", seed=1)
     scene = build_scene(tmp_path / "raw", tmp_path / "scene", SETTINGS, jobs=2).scene
     assert json.loads((scene / "scene.json").read_text())["evaluation"] == {"protocol": "half"}
+    assert json.loads((scene / "nb-info.json").read_text())["evaluation_protocol"] == "nerfw"
     opened = load_scene(scene)
     for view in opened.train:
         shadow = true_shadow(opened, view)

@@ -126,6 +126,11 @@ def test_missing_masks_are_named_or_the_photo_is_kept_whole(tmp_path):
     write_png(tmp_path / "m" / "p0.png", np.zeros((8, 12), np.uint8))
     with pytest.raises(AwError, match=r"2 of 3 photos have no mask: images/p1\.jpg, images/p2\.jpg"):
         find_masks(tmp_path / "m", photos_of(3), "error")
+    (tmp_path / "m" / "p0.png").rename(tmp_path / "m" / "other.png")
+    with pytest.raises(AwError, match=r"a mask of a\.jpg is called") as error:
+        find_masks(tmp_path / "m", photos_of(3), "keep")
+    assert "--masks-missing" not in str(error.value)
+    (tmp_path / "m" / "other.png").rename(tmp_path / "m" / "p0.png")
     found = find_masks(tmp_path / "m", photos_of(3), "keep")
     (tmp_path / "out").mkdir()
     lay_out_masks(tmp_path / "out", found, photos_of(3), tmp_path)

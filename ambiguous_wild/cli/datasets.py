@@ -156,16 +156,15 @@ def fetch_command(name: str | None, output: Path, as_json: bool) -> None:
     with ticking(desc=name, unit="B", unit_scale=True, disable=True if as_json else None) as tick:
         done = fetch(data, output, tick=tick, say=say)
     if as_json:
-        facts = {"archive": str(done.archive), "folder": str(done.folder) if done.folder else None}
+        facts = {"archive": str(done.archive), "folder": str(done.folder)}
         click.echo(json.dumps({**facts, "sha256": done.sha256, "first": done.first}, indent=2))
         return
     state = "recorded now, nothing to compare with" if done.first else "as recorded before"
     say(f"{done.archive}: sha256 {done.sha256[:16]}... ({state})", out=True)
-    if done.folder is not None:
-        say(
-            f"unpacked into {done.folder}; next: aw import {shlex.quote(str(done.folder))}/SCENE -o SCENE",
-            out=True,
-        )
+    say(
+        f"unpacked into {done.folder}; next: aw import {shlex.quote(str(done.folder))}/SCENE -o SCENE",
+        out=True,
+    )
 
 
 def _simulate(suite: Suite, output: Path, as_json: bool) -> None:

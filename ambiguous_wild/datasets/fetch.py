@@ -25,7 +25,7 @@ import msgspec
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.io.archive import extract
-from ambiguous_wild.io.files import check_output, folder_lock, own_json, sha256_file, write_json
+from ambiguous_wild.io.files import check_output, folder_lock, is_free, own_json, sha256_file, write_json
 from ambiguous_wild.io.plain_yaml import read_mapping
 
 CATALOGUE = Path(__file__).with_name("public.yaml")
@@ -92,7 +92,7 @@ class Fetched:
     """A downloaded archive."""
 
     archive: Path
-    folder: Path | None  # of the unpacked files; None if it was not unpacked
+    folder: Path  # of the unpacked files
     sha256: str
     first: bool  # it is the first download, whose hash was recorded
     downloaded: int  # bytes downloaded in this call
@@ -106,7 +106,6 @@ def fetch(
     data: PublicData,
     output: Path,
     *,
-    unpack: bool = True,
     tries: int = TRIES,
     wait_s: float = WAIT_S,
     tick: Callable[[int, int | None], None] = lambda done, total: None,
@@ -120,7 +119,6 @@ def fetch(
     Args:
         data: dataset of the catalogue.
         output: folder of datasets.
-        unpack: also unpack.
         tries: attempts before giving up; the downloaded part is kept.
         wait_s: seconds before the second attempt, doubled for each further one.
         tick: called with bytes so far and in total, None if the server does not state it.
@@ -152,8 +150,8 @@ def fetch(
         if prior is None:
             first = not data.sha256
             _record(folder, data, archive, actual)
-        target = output / data.name if unpack else None
-        if target is not None and not target.is_dir():
+        target = output / data.name
+        if not target.is_dir() or is_free(target):
             extract(archive, target)
     return Fetched(archive, target, actual, first, moved)
 

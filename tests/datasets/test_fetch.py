@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import threading
 import zipfile
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -93,7 +94,10 @@ def test_download_unpack_and_record(server, tmp_path):
     assert (tmp_path / "toy" / "scene" / "images" / "a.txt").read_text().startswith("photo")
     known = json.loads((tmp_path / "archives" / "downloads.json").read_text())
     assert known["toy"] == {"url": server.url, "sha256": done.sha256, "bytes": len(server.content)}
+    shutil.rmtree(done.folder)
+    done.folder.mkdir()  # an empty folder counts as none
     again = get(server, tmp_path)
+    assert (tmp_path / "toy" / "scene" / "images" / "a.txt").is_file()
     assert again.downloaded == 0 and not again.first and len(server.ranges) == 1
 
 

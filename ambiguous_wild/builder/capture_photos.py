@@ -36,6 +36,7 @@ from ambiguous_wild.builder.screen import sharpness, without_copies
 from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.io.files import atomic_dir, check_output, write_json
 from ambiguous_wild.io.mask_files import NO_PHOTOS
+from ambiguous_wild.io.page_parts import jpeg_bytes
 from ambiguous_wild.io.photos import UnreadablePhoto, read_photo
 
 QUALITY = 97  # of JPEG; video is compressed harder
@@ -73,7 +74,7 @@ def photos_from(
     Raises:
         AwError: too few photos that can be read, a video that cannot be read or is HDR, or `out` exists.
     """
-    check_free(out)
+    check_output(out, new=True)
     bar = bar or Bar(False)
     folders = [s for s in sources if s.is_dir()]
     if within := next((s for s in folders if out.resolve().is_relative_to(s.resolve())), None):
@@ -158,7 +159,7 @@ def _copy(
             views = pinhole_views(pixels)
             written = {target.with_name(f"{target.stem}_yaw{yaw:03}.jpg"): view for yaw, view in views}
             for path, view in written.items():
-                _write_jpeg(path, view)
+                path.write_bytes(jpeg_bytes(view, 95))
         else:
             shutil.copyfile(listed.path, target)
         for path, shown in written.items():
@@ -170,13 +171,6 @@ def _copy(
     if spheres:
         bar.say(f"{counted(spheres, '360 degree photo')} split into {len(YAWS_DEG)} pinhole views each")
     return photos, left
-
-
-def _write_jpeg(path: Path, pixels: np.ndarray) -> None:
-    done, data = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
-    if not done:
-        raise AwError(f"{path}: OpenCV could not encode it as JPEG")
-    path.write_bytes(data.tobytes())
 
 
 def _frames_of(video: Path, folder: Path, frames: int, bar: Bar) -> tuple[list[CapturedPhoto], FrameCounts]:
@@ -253,7 +247,7 @@ def photos_from_camera(
     Raises:
         AwError: there is no such camera, it stops, or `out` exists.
     """
-    check_free(out)
+    check_output(out, new=True)
     bar = bar or Bar(False)
     reader = _open(number)
     if not reader.isOpened():
@@ -308,17 +302,6 @@ def sharpest(
             best = VideoFrame(index, time_s, score, pixels.copy())
     if best is not None:
         yield best
-
-
-def check_free(out: Path) -> None:
-    """Check that `out` is free and can be written.
-
-    Raises:
-        AwError: it holds something, or cannot be written.
-    """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise AwError(f"{out} exists; nothing is overwritten: choose another -o or remove it")
-    check_output(out)
 
 
 def _open(source: Path | int) -> cv2.VideoCapture:
@@ -385,10 +368,7 @@ def _write(frames: Iterator[VideoFrame], folder: Path) -> list[CapturedPhoto]:
     photos: list[CapturedPhoto] = []
     for number, frame in enumerate(frames, start=1):
         name = f"frame_{number:05d}.jpg"
-        done, data = cv2.imencode(".jpg", frame.pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-        if not done:
-            raise OSError(f"{name}: the frame could not be encoded")
-        (folder / name).write_bytes(data.tobytes())
+        (folder / name).write_bytes(jpeg_bytes(frame.pixels[:, :, ::-1], QUALITY))
         photos.append(
             {
                 "photo": name,

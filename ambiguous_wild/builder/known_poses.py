@@ -62,7 +62,7 @@ def read_known_cameras(truth: Path | None, photos: Sequence[ScreenedPhoto]) -> C
         known = msgspec.convert(read_json(path), dict[str, KnownCamera])
     except msgspec.ValidationError as error:
         raise AwError(f"{path} holds no cameras of 'aw simulate' ({error}); {ESTIMATE}") from None
-    names = [_name_in_truth(photo.source) for photo in photos]
+    names = [name_in_truth(photo.source) for photo in photos]
     if absent := [photo.source for photo, name in zip(photos, names) if name not in known]:
         raise AwError(
             f"{path} has no camera of {counted(len(absent), 'photo')}: {shortlist(absent, 3)}; take "
@@ -80,7 +80,7 @@ def read_known_cameras(truth: Path | None, photos: Sequence[ScreenedPhoto]) -> C
     return ColmapModel({c.camera_id: c for c in cameras.values()}, images, points_without_tracks())
 
 
-def _name_in_truth(source: str) -> str:
+def name_in_truth(source: str) -> str:
     """Return the name of a photo in the truth: its path below train/, test/ or images/."""
     parts = PurePosixPath(source).parts
     return "/".join(parts[parts[0] in ("train", "test", "images") :])

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from ambiguous_wild.builder.known_poses import name_in_truth
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import ResampleResult, ScreenedPhoto
 from ambiguous_wild.core.errors import AwError, shortlist
@@ -165,8 +166,7 @@ def _truth(folder: Path, lens: Lens, photo: ScreenedPhoto, truth: Path, factor: 
     """Resample the truth of one photo: the clean one like the photo, numbers by the nearest, the others
     like masks.
     """
-    parts = PurePosixPath(photo.source).with_suffix("").parts
-    original = "/".join(parts[parts[0] in ("train", "test", "images") :])
+    original = PurePosixPath(name_in_truth(photo.source)).with_suffix("")
     written = []
     for part in TRUTH_PARTS:
         path = truth / part / f"{original}.png"

@@ -157,8 +157,7 @@ def point_checks(model: ColmapModel, test: set[str]) -> tuple[int, int]:
     if not len(lengths):
         return 0, 0
     in_train = ~np.isin(points.track_image_ids, tests)
-    owner = np.repeat(np.arange(len(lengths)), lengths)
-    trained = np.bincount(owner, weights=in_train, minlength=len(lengths))
+    trained = np.bincount(points.owners, weights=in_train, minlength=len(lengths))
     return int(((trained == 0) & (lengths > 0)).sum()), int((lengths == 2).sum())
 
 
@@ -175,7 +174,7 @@ def unfit_warnings(photos: Sequence[str]) -> list[str]:
 def parallax_deg(model: ColmapModel) -> float:
     """Return the median over points of the widest angle between first ray and another; NaN without points."""
     points = model.points
-    owner = np.repeat(np.arange(len(points.xyz)), np.diff(points.track_offsets))
+    owner = points.owners
     numbers = sorted(model.images)
     at = {number: k for k, number in enumerate(numbers)}
     poses = np.array([model.images[n].cam_from_world() for n in numbers]).reshape(-1, 4, 4)

@@ -39,6 +39,7 @@ from ambiguous_wild.io.files import write_json
 LOG = "colmap.log"
 DATABASE = "database.db"
 _POLL_S = 0.25
+# Diagonal of a 36 x 24 mm frame: "35 mm equivalent" focal lengths refer to it (CIPA DCG-001).
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
+from pathlib import PurePosixPath
 
 from ambiguous_wild.core.errors import AwError
 
@@ -40,6 +41,12 @@ def check_name(kind: str, name: str) -> str:
 def spelling_key(name: str) -> str:
     """Return what is equal for names that differ in case and in whether letters are composed only."""
     return unicodedata.normalize("NFC", name).casefold()
+
+
+def stays_below(path: str) -> bool:
+    """Whether a relative path names something below the folder that it starts from."""
+    pure = PurePosixPath(path)
+    return not pure.is_absolute() and ".." not in pure.parts and bool(pure.parts)
 
 
 def is_text(value: str) -> bool:

@@ -125,6 +125,11 @@ class SparsePoints:
         return len(self.xyz)
 
     @property
+    def owners(self) -> np.ndarray:
+        """Index of every observation's point, [L] int64."""
+        return np.repeat(np.arange(len(self)), np.diff(self.track_offsets))
+
+    @property
     def sure_xyz(self) -> np.ndarray:
         """Points [K, 3] seen by at least three photos, for surfaces; all points if these are too few."""
         sure = np.diff(self.track_offsets) >= 3

@@ -11,6 +11,7 @@ import numpy as np
 
 from ambiguous_wild.core.camera import pose_at
 from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.names import stays_below
 from ambiguous_wild.core.scene import Evaluation, Split
 from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, ColmapModel
 from ambiguous_wild.io.scene_folder import SIDES, without_suffix
@@ -52,12 +53,11 @@ def inside(name: str, root: Path) -> str:
     Raises:
         AwError: it is absolute, empty or holds "..".
     """
-    pure = PurePosixPath(name)
     if not name.isprintable():  # the split lists hold one name a line, in UTF-8
         raise AwError(f"{root} has a photo called {ascii(name)[:80]}, which no list can hold; rename it")
-    if pure.is_absolute() or ".." in pure.parts or not pure.parts or "\\" in name or "\0" in name:
+    if not stays_below(name) or "\\" in name:
         raise AwError(f"{root} names a file outside itself: {name[:80]!r}; do not use this dataset")
-    return str(pure)
+    return str(PurePosixPath(name))
 
 
 def plain(name: str) -> str:

@@ -132,7 +132,7 @@ def outward(scene: Scene) -> float:
 
 def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:
     """Return the train cameras that see five points or more, each with the median depth of its points."""
-    owner, cameras = _point_of_observation(scene), []
+    owner, cameras = scene.points.owners, []
     for index, view in enumerate(scene.views):
         if view.split == "train":
             pose = view.camera.cam_from_world
@@ -204,10 +204,6 @@ def _fit(direction: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 def _typical_spread(variances: np.ndarray) -> float:
     """Return the root of the median over points; NaN for fewer than ten."""
     return float(np.sqrt(max(np.median(variances), 0.0))) if len(variances) >= 10 else float("nan")
-
-
-def _point_of_observation(scene: Scene) -> np.ndarray:
-    return np.repeat(np.arange(len(scene.points)), np.diff(scene.points.track_offsets))
 
 
 Answer = Literal["on", "off", "unknown"]

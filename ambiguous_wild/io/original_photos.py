@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.names import stays_below
 from ambiguous_wild.io.colmap_records import MODELS, ModelCamera
 from ambiguous_wild.io.images import MAX_PIXELS
 
@@ -98,8 +99,7 @@ def _size(record: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _inside(name: str) -> str:
-    pure = PurePosixPath(name)
-    if pure.is_absolute() or ".." in pure.parts or not pure.parts:
+    if not stays_below(name):
         raise ValueError(f"{name!r} is no path in a folder")
     return name
 

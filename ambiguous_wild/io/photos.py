@@ -36,8 +36,6 @@ FROM_PROFILE = "colours converted to sRGB from"
 Named = Callable[[str], Any]  # OpenImageIO's name of a value -> the value; None if it is absent
 MIN_SIDE = 16  # px; smaller photos have no features
 
-# Diagonal of a 36 x 24 mm frame: "35 mm equivalent" focal lengths refer to it (CIPA DCG-001).
-_DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _NO_REASON = "OpenImageIO gives no reason"
 _HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _FORMAT_OF_SUFFIX = {
@@ -69,12 +67,6 @@ class Exif:
         """Make and model, joined."""
         parts = [p for p in (self.make, self.model) if p]
         return " ".join(parts) or None
-
-    def focal_px(self, width: int, height: int) -> float | None:
-        """Return the focal length in px of a photo of this size, by its 35 mm equivalent; None without."""
-        if self.focal_35mm is None:
-            return None
-        return self.focal_35mm * math.hypot(width, height) / _DIAGONAL_35MM
 
 
 class UnreadablePhoto(AwError):

@@ -13,7 +13,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.errors import shortlist, similar_path
-from ambiguous_wild.core.names import check_name, plain, quoted
+from ambiguous_wild.core.names import check_name, plain, quoted, stays_below
 from ambiguous_wild.core.scene import SceneInfo, Split, centred
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelImage
@@ -213,8 +213,7 @@ def read_list(path: Path) -> list[str]:
 
 
 def _inside(name: str, root: Path) -> str:
-    pure = PurePosixPath(name)
-    if pure.is_absolute() or ".." in pure.parts or not pure.parts:
+    if not stays_below(name):
         raise AwError(
             f"{root} names a file outside itself: {name!r}; if its photos lie in it, "
             f"'aw import {root} -o SCENE' finds them"

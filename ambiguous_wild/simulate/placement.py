@@ -72,7 +72,7 @@ def visible_points(scene: Scene) -> list[VisiblePoints]:
         raise AwError(
             f"{scene.root} has no points, so the depth of a cut-out is unknown; build it with COLMAP"
         )
-    owner = np.repeat(np.arange(len(scene.points)), np.diff(scene.points.track_offsets))
+    owner = scene.points.owners
     sites = []
     for view in scene.train:
         index = scene.views.index(view)

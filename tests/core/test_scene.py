@@ -70,3 +70,8 @@ def test_extent_of_a_capture_from_one_spot_is_positive():
     spread = np.array([[0, 0, 5.0], [0, 1, 5.0], [1, 0, 5.0]])
     assert scene_of([(0, "train"), (0, "train")], spread).extent > 1.0
     assert scene_of([(0, "train")]).extent == 1.0
+
+
+def test_every_observation_has_its_point():
+    points = replace(SparsePoints.without_tracks(np.zeros((4, 3))), track_offsets=np.array([0, 2, 2, 3, 3]))
+    assert points.owners.tolist() == [0, 0, 2]

@@ -108,15 +108,12 @@ def test_exif_is_read(tmp_path):
     assert (exif.focal_mm, exif.focal_35mm, exif.iso) == (5.0, 28.0, 200.0)
     assert exif.exposure_s == pytest.approx(0.01, rel=1e-3)
     assert exif.orientation == 1
-    # 28 mm on a 43.27 mm diagonal, on a 100 px diagonal
-    assert exif.focal_px(80, 60) == pytest.approx(28 * 100 / 43.2666, rel=1e-4)
 
 
 def test_without_exif_nothing_is_invented(tmp_path):
     exif = read_photo(save(tmp_path / "a.png", picture()))[0].exif
     assert exif.camera is None
     assert exif.focal_mm is None
-    assert exif.focal_px(80, 60) is None
 
 
 def cut(data, share):

@@ -178,10 +178,9 @@ def train_tracks(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     index_of = {view.name: i for i, view in enumerate(scene.train)}
     # the last entry is for view -1: observations in views outside the split
     table = np.array([index_of.get(v.name, -1) for v in scene.views] + [-1], dtype=np.int64)
-    point = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
     photo = table[points.track_views]
     used = (photo >= 0) & (points.track_views >= 0)
-    return point[used], photo[used], points.track_xy[used]
+    return points.owners[used], photo[used], points.track_xy[used]
 
 
 def static_instances(

@@ -35,8 +35,7 @@ class TrackColours:
 
 def tracks_of(scene: Scene) -> list[np.ndarray]:
     """Return for each train photo the sorted indices of its sparse points."""
-    points = scene.points
-    owner = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
+    points, owner = scene.points, scene.points.owners
     order = np.argsort(points.track_views, kind="stable")
     train = np.array([k for k, view in enumerate(scene.views) if view.split == "train"], np.int64)
     begins, ends = np.searchsorted(points.track_views[order], np.stack([train, train + 1]))
@@ -52,8 +51,7 @@ def track_colours(scene: Scene, photos: Iterable[np.ndarray]) -> TrackColours:
     """
     from scipy.ndimage import map_coordinates, uniform_filter
 
-    points = scene.points
-    of_point = np.repeat(np.arange(len(points)), np.diff(points.track_offsets))
+    points, of_point = scene.points, scene.points.owners
     train = {index: k for k, index in enumerate(i for i, v in enumerate(scene.views) if v.split == "train")}
     observed = []
     for (index, k), photo in zip(train.items(), photos, strict=True):

@@ -14,7 +14,7 @@ import numpy as np
 from ambiguous_wild.builder.bundle_adjustment import pipeline_options, plausible, shows_depth
 from ambiguous_wild.builder.component_merging import merge
 from ambiguous_wild.builder.matched import Matched, connected_photos
-from ambiguous_wild.builder.records import TURNED, ModelSummary, no_model
+from ambiguous_wild.builder.records import PURE_ROTATION, ModelSummary, no_model
 from ambiguous_wild.builder.registration import MIN_MODEL_PHOTOS, Registration
 from ambiguous_wild.builder.retrieval import FEW_PHOTOS, RELATIVE_POSES
 from ambiguous_wild.builder.settings import MIN_REGISTERED
@@ -71,7 +71,7 @@ def run_mapping(job: MappingJob) -> None:
     reliable = len(components[0].poses.keys() - components[0].provisional) if components else 0
     why = "no pair of photos to start from"
     if chosen is not None and len(chosen.poses) >= MIN_MODEL_PHOTOS and not shows_depth(chosen.model):
-        chosen, components, reliable, why = None, [], 0, TURNED
+        chosen, components, reliable, why = None, [], 0, PURE_ROTATION
     if chosen is None or len(chosen.poses) < MIN_MODEL_PHOTOS:
         left_out = dict.fromkeys(matched.names, why)
         left_out |= _left_out(components[0], components) if components else {}

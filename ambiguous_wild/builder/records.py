@@ -32,7 +32,7 @@ class ExifRecord(TypedDict, total=False):
     taken_at: str
 
 
-TURNED = "the camera only turned, which shows no depth"  # why no photo of a capture has a pose
+PURE_ROTATION = "the camera only turned, which shows no depth"  # why no photo of a capture has a pose
 
 
 @dataclass(frozen=True)

@@ -301,7 +301,7 @@ class Registration:
             if hypothesis is best or self._same(hypothesis.pose, best.pose):
                 continue
             evidence = hypothesis.evidence
-            if _turn_deg(hypothesis.pose, best.pose) < NEAR_DEG:
+            if _rotation_deg(hypothesis.pose, best.pose) < NEAR_DEG:
                 # It may be the same pose, less precise: evidence for both counts for the best only.
                 evidence = {k: rows for k, rows in evidence.items() if k not in best.evidence}
             elsewhere.append(self.hypothesis(photo, hypothesis.pose, evidence))
@@ -378,7 +378,7 @@ class Registration:
         if first is None or second is None:
             return False
         apart = float(np.linalg.norm(centre_of(first) - centre_of(second)))
-        return _turn_deg(first, second) < SAME_DEG and apart < SAME_SHARE * self.radius
+        return _rotation_deg(first, second) < SAME_DEG and apart < SAME_SHARE * self.radius
 
     def _area(self, photo: int, rows: Sequence[np.ndarray]) -> float:
         """Return the share of the photo's grid cells with features that hold one of the features `rows`."""
@@ -487,8 +487,8 @@ def centre_of(pose: np.ndarray) -> np.ndarray:
     return -pose[:, :3].T @ pose[:, 3]
 
 
-def _turn_deg(first: np.ndarray | None, second: np.ndarray | None) -> float:
-    """Return the angle between two poses [3, 4]; 180 where one is unknown."""
+def _rotation_deg(first: np.ndarray | None, second: np.ndarray | None) -> float:
+    """Return the rotation angle between two poses [3, 4]; 180 where one is unknown."""
     if first is None or second is None:
         return 180.0
     trace = float((first[:, :3] * second[:, :3]).sum())

@@ -27,7 +27,7 @@ PROBES = 8  # pairs that decide whether photos are a sequence
 # sequence, and in a pair that votes. Simulated walks of single photos have 0.75, with another place for each
 # distractor, simulated and real videos 0.83 to 0.98.
 SEQUENCE, FLOWS = 0.8, 0.5
-RETURNS_PX, RETURNS_SHARE = 1.0, 0.05  # largest distance after there and back: px, and share of the flow
+ERROR_PX, ERROR_SHARE = 1.0, 0.05  # largest forward-backward error: px, and share of the flow
 FAR_PX = 20.0  # median flow of the camera's rotation from which flow starts there, too
 COMPARED = 5  # px of a map, side of the window in which two matches are compared
 LEAST_PX = 0.35  # least uncertainty of a match
@@ -77,19 +77,19 @@ class SequenceFrame:
 
 
 @dataclass(frozen=True)
-class Matches:
+class FlowMatches:
     """Matches of one frame's map in another frame."""
 
     xy: np.ndarray  # [h, w, 2] float32, px of the other frame
-    return_px: np.ndarray  # [h, w] float32, distance after there and back
-    returns: np.ndarray  # [h, w] bool
+    error_px: np.ndarray  # [h, w] float32, forward-backward error
+    consistent: np.ndarray  # [h, w] bool, whether that error is small
     differs: np.ndarray  # [h, w] float32, mean absolute difference of grey around the pixel
     inside: np.ndarray  # [h, w] bool, whether it lies in the other frame
 
     @property
-    def returned(self) -> float:
-        """Share of the matches inside the other frame that return."""
-        return float((self.returns & self.inside).sum() / max(self.inside.sum(), 1))
+    def consistent_share(self) -> float:
+        """Share of the matches inside the other frame that are consistent."""
+        return float((self.consistent & self.inside).sum() / max(self.inside.sum(), 1))
 
 
 @dataclass(frozen=True)
@@ -134,17 +134,17 @@ def flow_votes(
         grey = cv2.resize(read(names[k]), size, interpolation=cv2.INTER_AREA)
         return SequenceFrame(grey, intrinsics, image.cam_from_world())
 
-    probed: dict[tuple[int, int], tuple[Matches, Matches]] = {}
+    probed: dict[tuple[int, int], tuple[FlowMatches, FlowMatches]] = {}
 
-    def pair(ab: tuple[int, int]) -> tuple[Matches, Matches]:
+    def pair(ab: tuple[int, int]) -> tuple[FlowMatches, FlowMatches]:
         return probed.get(ab) or _matches(frame(ab[0]), frame(ab[1]))
 
     probes = [(k, k + 1) for k in np.unique(np.linspace(0, count - 2, PROBES).astype(int)).tolist()]
     probed.update(zip(probes, in_order(pair, probes, threads), strict=True))
-    if np.median([there.returned for there, _ in probed.values()]) < SEQUENCE:
+    if np.median([there.consistent_share for there, _ in probed.values()]) < SEQUENCE:
         return
     tracked = any((image.point_ids >= 0).any() for image in images.values())
-    matches_of: dict[int, dict[int, Matches]] = {k: {} for k in range(count)}
+    matches_of: dict[int, dict[int, FlowMatches]] = {k: {} for k in range(count)}
     pairs = [(a, b) for b in range(count) for a in range(max(b - REACH, 0), b)]
     of_pairs = in_order(pair, pairs, threads)
     for latest in range(count + REACH):
@@ -154,11 +154,13 @@ def flow_votes(
             near = range(max(complete - POINTS_FROM, 0), min(complete + POINTS_FROM + 1, count))
             ids = np.unique(np.concatenate([images[names[n]].point_ids for n in near]))
             xyz = model.points.xyz[np.isin(model.points.ids, ids)]
-            others = [(frame(n), m) for n, m in matches_of.pop(complete).items() if m.returned >= FLOWS]
+            others = [
+                (frame(n), m) for n, m in matches_of.pop(complete).items() if m.consistent_share >= FLOWS
+            ]
             yield names[complete], count_votes(frame(complete), others, xyz if tracked else None)
 
 
-def _matches(first: SequenceFrame, second: SequenceFrame) -> tuple[Matches, Matches]:
+def _matches(first: SequenceFrame, second: SequenceFrame) -> tuple[FlowMatches, FlowMatches]:
     """Return the matches of the first frame's map in the second, and of the second's in the first.
 
     Flow reaches some 60 px. Where the camera's rotation moves the scene as far, flow from that start is a
@@ -174,7 +176,7 @@ def _matches(first: SequenceFrame, second: SequenceFrame) -> tuple[Matches, Matc
 
 def _candidate(
     first: SequenceFrame, second: SequenceFrame, start: np.ndarray | None, start_back: np.ndarray | None
-) -> tuple[Matches, Matches]:
+) -> tuple[FlowMatches, FlowMatches]:
     there, back = _flow(first.grey, second.grey, start), _flow(second.grey, first.grey, start_back)
     return _matched(first, second, there, back), _matched(second, first, back, there)
 
@@ -184,35 +186,35 @@ def _flow(first: np.ndarray, second: np.ndarray, start: np.ndarray | None) -> np
     return flow.calc(first, second, start)  # type: ignore[arg-type]
 
 
-def _matched(frame: SequenceFrame, other: SequenceFrame, there: np.ndarray, back: np.ndarray) -> Matches:
+def _matched(frame: SequenceFrame, other: SequenceFrame, there: np.ndarray, back: np.ndarray) -> FlowMatches:
     x, y = frame.map_positions()
     flow = cv2.remap(there, x, y, cv2.INTER_LINEAR)
     xy = np.dstack([x, y]) + flow
-    returned = cv2.remap(
+    backward = cv2.remap(
         back, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e4, 1e4)
     )
-    away = np.linalg.norm(flow + returned, axis=2)
+    error_px = np.linalg.norm(flow + backward, axis=2)
     looks = cv2.remap(other.grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     differs = cv2.absdiff(looks, cv2.remap(frame.grey, x, y, cv2.INTER_LINEAR))
-    returns = away <= RETURNS_PX + RETURNS_SHARE * np.linalg.norm(flow, axis=2)
+    consistent = error_px <= ERROR_PX + ERROR_SHARE * np.linalg.norm(flow, axis=2)
     differs = cv2.blur(differs.astype(np.float32), (COMPARED, COMPARED))
-    return Matches(xy, away, returns, differs, other.contains(xy))
+    return FlowMatches(xy, error_px, consistent, differs, other.contains(xy))
 
 
-def _better(one: Matches, two: Matches) -> Matches:
-    """Choose at each pixel the match that returns, of two the one that looks more alike."""
-    second = two.returns & (~one.returns | (two.differs < one.differs))
-    return Matches(
+def _better(one: FlowMatches, two: FlowMatches) -> FlowMatches:
+    """Choose at each pixel the match that is consistent, of two the one that looks more alike."""
+    second = two.consistent & (~one.consistent | (two.differs < one.differs))
+    return FlowMatches(
         np.where(second[..., None], two.xy, one.xy),
         *(
             np.where(second, getattr(two, n), getattr(one, n))
-            for n in ("return_px", "returns", "differs", "inside")
+            for n in ("error_px", "consistent", "differs", "inside")
         ),
     )
 
 
 def count_votes(
-    frame: SequenceFrame, others: Sequence[tuple[SequenceFrame, Matches]], xyz: np.ndarray | None
+    frame: SequenceFrame, others: Sequence[tuple[SequenceFrame, FlowMatches]], xyz: np.ndarray | None
 ) -> FlowVotes:
     """Count the frames in which each pixel stays or moves.
 
@@ -253,7 +255,7 @@ class _Neighbour:
     shift: np.ndarray  # [3]
     xy: np.ndarray  # [h, w, 2] px, the matches
     sigma_px: np.ndarray  # [h, w], uncertainty of the matches
-    valid: np.ndarray  # [h, w] bool: the match returns, and the frame shows the static surface, too
+    valid: np.ndarray  # [h, w] bool: the match is consistent, and the frame shows the static surface, too
 
     def project(self, inverse: np.ndarray) -> np.ndarray:
         """Return x and y in px, [h, w, 2], of pixels of these inverse depths [h, w]."""
@@ -275,7 +277,7 @@ class _Neighbour:
 
 
 def _neighbour(
-    frame: SequenceFrame, other: SequenceFrame, matches: Matches, depths: tuple[np.ndarray, np.ndarray]
+    frame: SequenceFrame, other: SequenceFrame, matches: FlowMatches, depths: tuple[np.ndarray, np.ndarray]
 ) -> _Neighbour:
     x, y = frame.map_positions()
     relative = other.cam_from_world @ np.linalg.inv(frame.cam_from_world)
@@ -284,12 +286,12 @@ def _neighbour(
         rays @ (other.intrinsics @ relative[:3, :3]).T,
         other.intrinsics @ relative[:3, 3],
         matches.xy,
-        np.maximum(LEAST_PX, matches.return_px),
-        matches.returns,
+        np.maximum(LEAST_PX, matches.error_px),
+        matches.consistent,
     )
     # what leaves the frame finds a wrong match in it
     shown = [other.contains(neighbour.project(inverse)) for inverse in depths]
-    return replace(neighbour, valid=matches.returns & shown[0] & shown[1])
+    return replace(neighbour, valid=matches.consistent & shown[0] & shown[1])
 
 
 def surrounding_inverse_depths(frame: SequenceFrame, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

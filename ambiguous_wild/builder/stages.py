@@ -26,7 +26,7 @@ from ambiguous_wild.builder.moving_features import write_motion
 from ambiguous_wild.builder.pose_hypothesis import TWO_POSES
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import (
-    TURNED,
+    PURE_ROTATION,
     BuildInputs,
     FeatureResult,
     KeyedRecord,
@@ -286,7 +286,7 @@ class Stages:
         if wanted > len(components) > 0:
             raise AwError(f"no part {wanted}: {'; '.join(parts) or 'the photos form one part'}; omit --part")
         built = best.mapping.facts["model"] is not None
-        turned = set() if built else {TURNED} & set(best.mapping.facts["left_out"].values())
+        turned = set() if built else {PURE_ROTATION} & set(best.mapping.facts["left_out"].values())
         used = ["masks were used (white = keep): try without them"] if masks is not None else []
         used = mask_warnings(masks.facts if masks else None) or used
         check_registered(

@@ -267,7 +267,7 @@ def export_command(
 def _transform(e: ExportedModel) -> str:
     x, y, z = e.transform.centre
     smaller = "" if e.transform.scale == 1 else f"divide by {e.transform.scale:g}, then "
-    w, *axis = e.transform.turn
+    w, *axis = e.transform.quat
     back = (
         ""
         if w == 1

@@ -30,12 +30,12 @@ class SceneTransform:
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale: float = 1.0  # a power of two, so that positions lose no bit
-    turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # R as w, x, y, z; of exports alone
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # R as w, x, y, z; of exports alone
 
     @property
     def rotation(self) -> np.ndarray:
         """R, [3, 3]."""
-        return rotation_from_quat(np.array(self.turn))
+        return rotation_from_quat(np.array(self.quat))
 
     def inside(self, camera: Camera) -> Camera:
         """Return a camera of the files' coordinates in those of training."""
@@ -169,7 +169,7 @@ class Scene:
 
         Test cameras do not enter: their poses are not known to a method that trains.
         """
-        centers = np.array([v.camera.center for v in together(self.train or self.views)])
+        centers = np.array([v.camera.center for v in without_outliers(self.train or self.views)])
         radius = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(initial=0.0))
         # A capture from one spot has no baseline: the points keep the learning rates finite.
         if radius <= 0.0 and len(self.points):
@@ -198,7 +198,7 @@ def centred(scene: Scene) -> Scene:
 
     Training and rendering use float32 and draw nothing nearer than 0.01.
     """
-    centers = np.array([v.camera.center for v in together(scene.train or scene.views)])
+    centers = np.array([v.camera.center for v in without_outliers(scene.train or scene.views)])
     xyz, middle = scene.points.xyz, np.median(centers, axis=0)
     depth = float(np.median(np.linalg.norm(xyz - middle, axis=1))) if len(xyz) else 0.0
     size = max(_away(centers)[1], depth)
@@ -216,13 +216,13 @@ def centred(scene: Scene) -> Scene:
     return replace(scene, views=views, points=points, transform=transform)
 
 
-def together(views: tuple[View, ...]) -> tuple[View, ...]:
+def without_outliers(views: tuple[View, ...]) -> tuple[View, ...]:
     """Return the views without the few whose cameras lie far from the rest: their poses are wrong."""
-    near = near_others(np.array([v.camera.center for v in views]))
-    return views if near.all() else tuple(v for v, inside in zip(views, near) if inside)
+    inlier = inlier_centers(np.array([v.camera.center for v in views]))
+    return views if inlier.all() else tuple(v for v, kept in zip(views, inlier) if kept)
 
 
-def near_others(centers: np.ndarray) -> np.ndarray:
+def inlier_centers(centers: np.ndarray) -> np.ndarray:
     """Whether each camera centre [N, 3] lies near the others, [N] bool; all True if many lie far away."""
     away, usual = _away(centers)
     near = away <= _FAR_CAMERA * usual

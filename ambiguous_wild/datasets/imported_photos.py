@@ -50,7 +50,7 @@ class PhotoPlan:
     small: Path | None  # a downsampled copy that is linked
     only_small: bool  # the dataset has downsampled photos only
     convert: bool  # its pixels change, so a PNG is written
-    turn: int = 1  # EXIF orientation that the model's photo was turned by; COLMAP does not turn photos
+    orientation: int = 1  # EXIF orientation that was applied to the model's photo; COLMAP applies none
 
 
 @dataclass(frozen=True)
@@ -116,13 +116,13 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
             wrong.append(
                 f"{image.name} ({size[0]}x{size[1]}, more than {MAX_PIXELS // 1_000_000} megapixels)"
             )
-        elif (turn := _turn(scene.model, image, source, size)) is None:
+        elif (tag := _orientation(scene.model, image, source, size)) is None:
             turned = ", turned" if _same_shape(size[::-1], (camera.width, camera.height)) else ""
             needed = f"its camera {camera.width}x{camera.height}{turned}"
             wrong.append(f"{image.name} ({size[0]}x{size[1]}, {needed})")
         else:
-            size = size[::-1] if turn > 4 else size
-            plans.append(_plan(scene, image, source, camera, size, only_small, turn))
+            size = size[::-1] if tag > 4 else size
+            plans.append(_plan(scene, image, source, camera, size, only_small, tag))
     refuse_same_stems(scene.root, sorted(scene.split))
     total = len(scene.split)
     if absent:
@@ -149,7 +149,7 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
     return plans
 
 
-def _turn(model: ColmapModel, image: ModelImage, source: Path, size: tuple[int, int]) -> int | None:
+def _orientation(model: ColmapModel, image: ModelImage, source: Path, size: tuple[int, int]) -> int | None:
     """Return the EXIF orientation if the model was made of the upright photo, else 1; None: neither fits.
 
     The shape of the camera decides; where both shapes fit, the colours of the points do.
@@ -183,7 +183,7 @@ def _plan(
     camera: ModelCamera,
     size: tuple[int, int],
     only_small: bool,
-    turn: int,
+    tag: int,
 ) -> PhotoPlan:
     lens = lens_of(resized(camera, *size)) if camera.model not in PINHOLES else None
     wide = scene.max_width is not None and size[0] > scene.max_width
@@ -191,7 +191,7 @@ def _plan(
         (lens is not None and lens.map_xy is not None)
         or wide
         or scene.background is not None
-        or turn > 1
+        or tag > 1
         or bool(file_colours(source).name)
     )
     small = None
@@ -204,7 +204,7 @@ def _plan(
                 f"no copy of it; remove images_{scene.factor} to make it anew"
             )
     at_size = camera if not (convert or only_small) else resized(camera, *size)
-    return PhotoPlan(image, source, at_size, small, only_small, convert, turn)
+    return PhotoPlan(image, source, at_size, small, only_small, convert, tag)
 
 
 @lru_cache(maxsize=4)  # a map of a photo of 12 megapixels takes 98 MB
@@ -272,15 +272,15 @@ def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPho
     if lens.map_xy is not None:
         lost = f" without {100 * (1 - lens.share):.0f} % of the photo" if lens.share < MAX_LOST else ""
         notes.insert(0, f"undistorted{lost}")
-    if plan.turn > 1:
-        notes.insert(0, f"turned upright (EXIF orientation {plan.turn})")
+    if plan.orientation > 1:
+        notes.insert(0, f"turned upright (EXIF orientation {plan.orientation})")
     if profile := file_colours(plan.source).name:
         notes.insert(0, f"{FROM_PROFILE} {profile}")
     if scene.background is not None:
         notes.insert(0, "composited over a background of {}, {}, {}".format(*scene.background))
     small = folder / f"images_{factor}" / name
     if not (full / name).is_file() or (factor > 1 and not small.is_file()):
-        pixels = lens.remap(upright(_read(plan.source, scene.background), plan.turn), nearest=False)
+        pixels = lens.remap(upright(_read(plan.source, scene.background), plan.orientation), nearest=False)
         if wide:
             pixels = downsample_photo(pixels, target.width, target.height)
         write_png(full / name, pixels)
@@ -348,13 +348,13 @@ def place_mask(plan: PhotoPlan, placed: PlacedPhoto, scene: ForeignScene, folder
     target = folder / "masks" / side / f"{without_suffix(placed.image.name)}.png"
     if target.is_file() or (mask is None and alpha is None):
         return alpha is not None
-    alpha = upright(alpha, plan.turn) if alpha is not None else None
+    alpha = upright(alpha, plan.orientation) if alpha is not None else None
     pixels = upright(read_mask(mask), orientation(mask)) if mask is not None else np.asarray(alpha)
     stored = header_size(plan.source) or (plan.camera.width, plan.camera.height)
-    size = stored[::-1] if plan.turn > 4 else stored
+    size = stored[::-1] if plan.orientation > 4 else stored
     height, width = pixels.shape
     # A mask may be drawn on the photo as stored or as shown, whatever the model was made of.
-    turned = plan.turn if plan.turn > 4 else BACK.get(orientation(plan.source), 1)
+    turned = plan.orientation if plan.orientation > 4 else BACK.get(orientation(plan.source), 1)
     if size != (width, height) == size[::-1] and turned > 4:
         pixels = upright(pixels, turned)
         height, width = pixels.shape

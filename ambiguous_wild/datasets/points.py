@@ -24,7 +24,7 @@ from ambiguous_wild.builder.sfm import (
     run_job,
 )
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.scene import Split, near_others
+from ambiguous_wild.core.scene import Split, inlier_centers
 from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.colmap_records import (
     ColmapModel,
@@ -74,7 +74,7 @@ def random_points(
     if not blender:
         poses = [i.cam_from_world() for i in model.images.values() if split.get(i.name) == "train"]
         centres = np.array([-p[:3, :3].T @ p[:3, 3] for p in poses])
-        centres = centres[near_others(centres)]
+        centres = centres[inlier_centers(centres)]
         centre = centres.mean(axis=0)
         half = CAMERA_SIDE * float(np.linalg.norm(centres - centre, axis=1).max())
     xyz = centre + (half or 1.0) * generator.uniform(-1, 1, (RANDOM_POINTS, 3))

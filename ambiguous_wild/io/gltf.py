@@ -110,7 +110,7 @@ def encode_gltf(
 
 def _node(transform: SceneTransform) -> dict[str, object]:
     """Return the node that turns and moves the model to where glTF's viewers expect it."""
-    if transform.turn != UNMOVED.turn:  # the caller turned the model so that y is up
+    if transform.quat != UNMOVED.quat:  # the caller turned the model so that y is up
         return {"mesh": 0}
     x, y, z = transform.centre
     return {"mesh": 0, "rotation": _HALF_TURN} | (

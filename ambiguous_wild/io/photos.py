@@ -89,7 +89,7 @@ class Photo:
     plain: bool  # 8-bit upright RGB with the right suffix: other tools read the same pixels
     notes: tuple[str, ...]  # what was converted, e.g. "16 bits reduced to 8"
     sphere: bool = False  # a 360 degree photo, as its metadata say
-    turned: int = 1  # EXIF orientation that was applied to the pixels in the file; 1 = none
+    orientation: int = 1  # EXIF orientation that was applied to the pixels in the file; 1 = none
 
 
 def read_photo(
@@ -183,13 +183,13 @@ def _read_by_pillow(source: Path, form: str) -> tuple[Photo, np.ndarray]:
     rgb, more = _three_channels(source, pixels, names, "")
     rgb = _in_srgb(rgb, colours, notes)
     exif = _block_exif(raw)
-    turned = exif.orientation if form == "avif" else 1
-    if turned != 1:
-        more.append(f"turned upright (EXIF orientation {turned})")
-        rgb = np.ascontiguousarray(upright(rgb, turned))
+    orientation = exif.orientation if form == "avif" else 1
+    if orientation != 1:
+        more.append(f"turned upright (EXIF orientation {orientation})")
+        rgb = np.ascontiguousarray(upright(rgb, orientation))
     notes += [*more, *_misnamed(source, form)]
     height, width = rgb.shape[:2]
-    return Photo(source, form, width, height, exif, False, tuple(notes), turned=turned), rgb
+    return Photo(source, form, width, height, exif, False, tuple(notes), orientation=orientation), rgb
 
 
 def _register_heif() -> bool:

@@ -98,8 +98,8 @@ def rescaled(gaussians: Arrays, factor: float) -> Arrays:
 
 def splat_comments(transform: SceneTransform, antialias: bool) -> list[str]:
     """Return header lines of a PLY that record its scene's transform and how its Gaussians are drawn."""
-    values = {"offset": transform.centre, "training_scale": (transform.scale,), "rotation": transform.turn}
-    if transform.turn == UNMOVED.turn:
+    values = {"offset": transform.centre, "training_scale": (transform.scale,), "rotation": transform.quat}
+    if transform.quat == UNMOVED.quat:
         del values["rotation"]
     lines = [f"comment {name} {' '.join(map(repr, numbers))}" for name, numbers in values.items()]
     lines = [] if transform == UNMOVED else lines
@@ -129,11 +129,11 @@ def header_transform(data: bytes, path: Path | str) -> SceneTransform:
     if not {b"offset", b"training_scale"} <= words.keys():
         return UNMOVED
     try:
-        offset, (scale,), turn = (
+        offset, (scale,), quat = (
             [float(v) for v in words.get(name, b"1 0 0 0").split()]
             for name in (b"offset", b"training_scale", b"rotation")
         )
-        return checked_transform(offset, scale, turn)
+        return checked_transform(offset, scale, quat)
     except ValueError:
         raise AwError(f"{path}: its comments offset and training_scale are damaged; train again") from None
 

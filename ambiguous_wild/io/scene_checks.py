@@ -15,7 +15,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import counted, shortlist
-from ambiguous_wild.core.scene import together
+from ambiguous_wild.core.scene import without_outliers
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.images import decode, load_image_float, read_alpha
 from ambiguous_wild.io.mask_files import SPELLINGS
@@ -196,7 +196,7 @@ def _correlation(small: Path, photo: Path) -> float:
 
 
 def _far_cameras(scene: Scene) -> list[str]:
-    return sorted({view.name for view in scene.train} - {view.name for view in together(scene.train)})
+    return sorted({view.name for view in scene.train} - {view.name for view in without_outliers(scene.train)})
 
 
 def _one_position(scene: Scene) -> list[str]:

@@ -106,15 +106,15 @@ def from_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def checked_transform(
-    offset: Sequence[float], scale: float, turn: Sequence[float] = UNMOVED.turn
+    offset: Sequence[float], scale: float, quat: Sequence[float] = UNMOVED.quat
 ) -> SceneTransform:
     """Return the transform that a file records.
 
     Raises:
         ValueError: the numbers are invalid.
     """
-    (x, y, z), (a, b, c, d) = offset, turn
-    if not (scale > 0 and np.isfinite([x, y, z, scale, a, b, c, d]).all() and any(turn)):
+    (x, y, z), (a, b, c, d) = offset, quat
+    if not (scale > 0 and np.isfinite([x, y, z, scale, a, b, c, d]).all() and any(quat)):
         raise ValueError("invalid transform")
     return SceneTransform(
         (float(x), float(y), float(z)), float(scale), (float(a), float(b), float(c), float(d))
@@ -123,15 +123,15 @@ def checked_transform(
 
 def transform_record(transform: SceneTransform) -> dict[str, float | list[float]]:
     """Return the transform as written to files: the user's coordinates are positions / scale + offset."""
-    turned = {} if transform.turn == UNMOVED.turn else {"rotation": list(transform.turn)}
-    return (
-        {} if transform == UNMOVED else {"offset": list(transform.centre), "scale": transform.scale, **turned}
-    )
+    if transform == UNMOVED:
+        return {}
+    rotation = {} if transform.quat == UNMOVED.quat else {"rotation": list(transform.quat)}
+    return {"offset": list(transform.centre), "scale": transform.scale, **rotation}
 
 
 def transform_from(facts: Any) -> SceneTransform:
     """Return the transform for a result of `transform_record`; `UNMOVED` for anything else."""
     try:
-        return checked_transform(facts["offset"], facts["scale"], facts.get("rotation", UNMOVED.turn))
+        return checked_transform(facts["offset"], facts["scale"], facts.get("rotation", UNMOVED.quat))
     except (KeyError, TypeError, ValueError, AttributeError):
         return UNMOVED

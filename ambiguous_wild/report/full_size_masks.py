@@ -107,7 +107,7 @@ class _CapturePhotos:
         if not self.original:
             return _Opened(read_png_rgb(path), tag=orientation(path))
         opened, pixels = read_photo(path)
-        return _Opened(pixels, opened.turned, opened.turned)
+        return _Opened(pixels, opened.orientation, opened.orientation)
 
     def check_unchanged(self) -> None:
         """Raise AwError where files are gone, or differ from those that the scene was built from."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, SceneTransform
-from ambiguous_wild.core.scene import together
+from ambiguous_wild.core.scene import without_outliers
 from ambiguous_wild.io.images import to_uint8
 from ambiguous_wild.io.ply import read_splat_ply, read_transform, splat_count, stated_up
 from ambiguous_wild.io.splat_arrays import Arrays, SplatFile
@@ -38,7 +38,7 @@ class Space:
 
 def space_of(scene: Scene) -> Space:
     """Find up as the mean of the photos' up, and the middle at the median depth of the photos' points."""
-    views = together(scene.train or scene.views)
+    views = without_outliers(scene.train or scene.views)
     poses = np.array([v.camera.cam_from_world for v in views])
     up = -poses[:, 1, :3].mean(axis=0)
     size = np.linalg.norm(up)
@@ -138,7 +138,7 @@ def moved(gaussians: Arrays, of: SceneTransform, to: SceneTransform) -> Arrays:
     turn = to.rotation @ of.rotation.T
     placed = {**gaussians, "means": (factor * gaussians["means"] @ turn.T + shift).astype(np.float32)}
     placed["log_scales"] = (gaussians["log_scales"] + np.log(factor)).astype(np.float32)
-    if of.turn != to.turn:
+    if of.quat != to.quat:
         placed["quats"] = _turned_quats(gaussians["quats"], turn)
         placed["sh_rest"] = _turned_harmonics(gaussians["sh_rest"], turn)
     return placed

@@ -15,7 +15,7 @@ import numpy as np
 from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.core.camera import pose_at, rigid
 from ambiguous_wild.core.names import ascii_text
-from ambiguous_wild.core.scene import NO_PHOTO, centred, together
+from ambiguous_wild.core.scene import NO_PHOTO, centred, without_outliers
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.untrusted import read_json
 from ambiguous_wild.viewing.model import Renderer, ViewedModel, space_of
@@ -38,7 +38,7 @@ def through_views(scene: Scene, frames: int, size: tuple[int, int]) -> list[Came
         frames: number of cameras, evenly spaced along the path.
         size: width and height, px; the lens is that of the views, fitted to it.
     """
-    views = together(scene.test or scene.train)
+    views = without_outliers(scene.test or scene.train)
     keys = [view.camera for view in views]
     order = _nearest_next(np.array([camera.center for camera in keys]))
     return _smooth([keys[i] for i in order], frames, size)

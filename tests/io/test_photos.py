@@ -42,7 +42,7 @@ def test_exif_orientation_is_applied_as_opencv_does(tmp_path, orientation):
     reference = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)  # OpenCV turns by the tag
     assert pixels.shape == reference.shape == (photo.height, photo.width, 3)
     assert np.abs(pixels.astype(int) - reference).max() <= 1
-    assert not photo.plain and photo.turned == orientation
+    assert not photo.plain and photo.orientation == orientation
     assert "upright" in photo.notes[0]
 
 

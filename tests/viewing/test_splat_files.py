@@ -74,7 +74,7 @@ def test_an_upright_export_renders_the_same_from_turned_cameras(tmp_path: Path, 
         assert file.psnr_to_model is not None and file.psnr_to_model > (35 if file.format == "spz" else 50)
         up = AXES["y" if file.format == "gltf" else axis]
         splats = read_splats(file.path)
-        assert splats.transform.turn == pytest.approx(file.transform.turn) and splats.transform.centre != (
+        assert splats.transform.quat == pytest.approx(file.transform.quat) and splats.transform.centre != (
             0,
             0,
             0,

@@ -7,9 +7,9 @@ members of one name, and archive bombs. Sizes are counted while writing, never t
 from __future__ import annotations
 
 import bz2
-import glob
 import gzip
 import io
+import os
 import stat
 import tarfile
 import zipfile
@@ -118,9 +118,13 @@ def pack_folder(folder: Path | str, limit_mb: float) -> bytes:
         AwError: the files are larger.
     """
     root = Path(folder)
-    # Names that begin with a dot, which glob leaves out, are locks, caches and unfinished files.
-    below = sorted(root / name for name in glob.iglob("**", root_dir=root, recursive=True))
-    paths = [path for path in below if path.is_file()]
+    paths = []
+    for at, folders, files in os.walk(root, followlinks=True):
+        real = Path(at).resolve()
+        # Names that begin with a dot are locks, caches and unfinished files; a link may lead back up.
+        folders[:] = [n for n in folders if n[0] != "." and not real.is_relative_to(Path(at, n).resolve())]
+        paths += [Path(at, n) for n in files if n[0] != "." and Path(at, n).is_file()]
+    paths.sort()
     size_mb = sum(p.stat().st_size for p in paths) / 1e6
     if size_mb > limit_mb:
         raise AwError(

@@ -159,6 +159,7 @@ def test_a_folder_comes_back_as_it_was_without_what_is_hidden(tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "p.jpg").write_text("of a linked folder")
     (source / "images").symlink_to(tmp_path / "photos")
+    (source / "deep" / "round").symlink_to(source)
     target.mkdir()
     names = unpack(pack_folder(source, 1.0), target, SMALL)
     assert tree(target) == {

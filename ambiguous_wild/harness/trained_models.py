@@ -265,8 +265,9 @@ def _retrain_command(run: Path, result: RunResult) -> str:
         words = shlex.split(str(result.get("reproduce", "")))
     except ValueError:
         return ""
-    iterations, runs = result["cost"].get("iterations"), run.resolve().parents[2]
-    if words[:2] != ["aw", "bench"] or not iterations:
+    cost, runs = result["cost"], _folder_of_runs(run)
+    iterations = cost.get("iterations")
+    if words[:2] != ["aw", "bench"] or not iterations or "passes" in cost:  # two passes cannot go on
         return ""
     options = [
         (option, str(_from_here(Path(value), runs)) if value.startswith("/") else value)
@@ -276,6 +277,11 @@ def _retrain_command(run: Path, result: RunResult) -> str:
     options += [("-o", str(_from_here(runs, runs))), ("--iterations", str(round(1.5 * iterations)))]
     options += [("--overwrite", "longer"), ("--corrections", "corrections.json")]
     return shlex.join(["aw", "bench", *(word for pair in options for word in pair)])
+
+
+def _folder_of_runs(run: Path) -> Path:
+    """Return the folder that holds SCENE/METHOD/SEED, else the root folder: a run may be moved anywhere."""
+    return Path(*run.resolve().parts[:-3] or run.resolve().parts[:1])
 
 
 def _from_here(path: Path, runs: Path) -> Path:
@@ -293,10 +299,11 @@ def next_steps(shown: SceneModels, *, on_page: bool = True) -> list[str]:
     """
     steps: list[str] = []
     for run, model in zip(shown.runs, shown.models):
-        runs = run.resolve().parents[2]
-        place, root = str(run), str(run.parents[2])
+        runs = _folder_of_runs(run)
         if on_page:
             place, root = str(_from_here(run.resolve(), runs)), str(_from_here(runs, runs))
+        else:
+            place, root = str(run), str(run.parents[2])
         if model.masks is not None:
             steps.append(f"masks of {model.label}, white = static: `{place}/{MASKS}`")
             full = shlex.join(["aw", "masks", place, "-o", "masks"])

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.trained_models import Viewer, read_render_settings, view_runs
+from ambiguous_wild.harness.trained_models import SceneModels, Viewer, next_steps, read_render_settings, view_runs
 from ambiguous_wild.io.files import own_json, sha256_file, write_json
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.mask_reasons import reasons_of, write_reasons
@@ -367,6 +367,19 @@ def test_the_panel_names_files_and_the_command_that_trains_on(
     assert chosen["next"] == [HOSTILE]
     change_result(run, lambda r: r.update(reproduce='aw "'))
     assert facts(view_runs([run], tmp_path / "page").path.read_text())["models"][0]["retrain"] == ""
+
+
+def test_a_run_may_be_named_from_within_and_lie_anywhere(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = next(path.parent for path in runs.rglob("config.yaml"))
+    for here, name in ((run.parent, run.name), (run, ".")):
+        monkeypatch.chdir(here)
+        assert facts(view_runs([Path(name)], tmp_path / "page").path.read_text())["next"]
+    model = ViewedModel("3dgs", Path("point_cloud.ply"))
+    monkeypatch.chdir("/")
+    shown = SceneModels(load_scene(runs.parent / "porch"), (model,), (), runs=(Path("/data/seed0"),))
+    assert "`aw export data/seed0`" in next_steps(shown)[0]
 
 
 def test_reasons_of_a_run_come_with_its_masks_and_damaged_ones_do_not(runs: Path, tmp_path: Path) -> None:

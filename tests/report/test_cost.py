@@ -139,6 +139,14 @@ def test_what_started_elsewhere_is_not_recommended(tmp_path: Path) -> None:
         recommend(runs.runs, "yard", 60.0)
 
 
+def test_settings_that_share_no_scene_are_not_compared(tmp_path: Path) -> None:
+    for method, scene, psnr in (("a", "yard", 30.0), ("b", "porch", 20.0), ("c", "porch", 21.0)):
+        cost_run(tmp_path, method, scene, psnr=(psnr,))
+    found = recommend(read(tmp_path).runs, "square", 600.0)
+    assert [choice.method for choice in found.choices] == ["c", "b"]
+    assert "not compared, as they share no scene with the others: a" in found.notes
+
+
 def test_plans_of_one_scene_that_differ_make_no_seeds(tmp_path: Path) -> None:
     for seed, effects in enumerate([("skybox",), ("exposure",)]):
         run = cost_run(tmp_path, "a", seed=seed, effects=effects)

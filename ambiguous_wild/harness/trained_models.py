@@ -325,6 +325,9 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
 
     An unknown method is drawn as plain 3DGS. The run may come from a stranger: no file that its name refers
     to is imported.
+
+    Raises:
+        AwError: effects or background are damaged.
     """
     name, source = str(config.get("method", "")), str(config.get("source", ""))
     options = section(config, "options")
@@ -349,9 +352,16 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
         hooks = entry.build(from_plain(type(entry.options()), options, "options"))
     except AwError as error:  # an option of another version
         hooks, note = entry.build(entry.options()), f"{name} is drawn with its present defaults: {error}"
-    antialias = hooks.antialias or "antialias" in (config.get("effects") or ())
-    behind = section(config, "scene").get("background", hooks.background)
-    red, green, blue = (float(value) for value in behind)
+    effects, behind = (
+        config.get("effects") or (),
+        section(config, "scene").get("background", hooks.background),
+    )
+    try:
+        antialias = hooks.antialias or "antialias" in effects
+        red, green, blue = map(float, behind)
+    except (TypeError, ValueError):
+        values = f"effects {str(effects)[:40]!a}, background {str(behind)[:40]!a}"
+        raise AwError(f"{CONFIG} of a run of {name} is damaged ({values}): restore it") from None
     return RenderSettings(hooks.sh_degree, antialias, hooks.blur, (red, green, blue)), note
 
 

@@ -15,7 +15,13 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.trained_models import SceneModels, Viewer, next_steps, read_render_settings, view_runs
+from ambiguous_wild.harness.trained_models import (
+    SceneModels,
+    Viewer,
+    next_steps,
+    read_render_settings,
+    view_runs,
+)
 from ambiguous_wild.io.files import own_json, sha256_file, write_json
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.mask_reasons import reasons_of, write_reasons
@@ -224,6 +230,9 @@ def test_a_stranger_s_method_name_imports_no_file(runs: Path, tmp_path: Path) ->
     look, note = read_render_settings(config)
     assert not (tmp_path / "ran").exists() and look == RenderSettings() and "--plugin" in note
     assert read_render_settings({"method": "3dgs", "options": {}, "effects": ["antialias"]})[0].antialias
+    for damaged in ({"effects": 5}, {"scene": {"background": [0, 0]}}, {"scene": {"background": None}}):
+        with pytest.raises(AwError, match="damaged"):
+            read_render_settings({"method": "3dgs", "options": {}, **damaged})
     look, note = read_render_settings({"method": "3dgs", "options": {"gone": 1}, "effects": ["antialias"]})
     assert look.antialias and "'gone'" in note
 

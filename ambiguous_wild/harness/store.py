@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "code_hash", "config_hash", "scene_hash", "source",
     "options_hash", "training", "unrecorded", "timing", "timing_reason", "timing_kernel", "hardware",
-    "effects", "length", "features", "test_photos", "no_masks", "start", "metric_functions",
+    "effects", "fit", "length", "features", "test_photos", "no_masks", "start", "metric_functions",
 )  # fmt: skip
 FolderResult = tuple[Path, RunResult]  # a run folder and its result
 # config.yaml as read: absent keys and wrong types are possible, as the file may be old, damaged or edited

@@ -150,7 +150,6 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--iterations", type=count, default=1500)
     parser.add_argument("--jobs", type=count, default=2, help="runs at a time")
     parser.add_argument("--results", type=Path, default=RESULTS, help="where the table goes")
-    parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
     return parser.parse_args(words)
 
 

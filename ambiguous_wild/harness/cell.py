@@ -46,9 +46,9 @@ from ambiguous_wild.harness.start import StartFile
 from ambiguous_wild.io.corrections import CorrectionsFile
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.motion_points import FILE as MOTION
+from ambiguous_wild.methods.entry import second_pass_name
 from ambiguous_wild.methods.graft import Graft
 from ambiguous_wild.methods.references import reference_file
-from ambiguous_wild.methods.entry import second_pass_name
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
 from ambiguous_wild.splat.train_config import TrainConfig
 

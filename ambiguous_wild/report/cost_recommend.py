@@ -18,6 +18,7 @@ import numpy as np
 
 from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.grouping import grouped
+from ambiguous_wild.harness.command_lines import length_options
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_curves import Curve, curves_of, duration, scenes_of, summary
@@ -61,8 +62,8 @@ class Recommendation:
 
     def command(self, scene: str) -> str:
         """Return the command that trains the recommended setting."""
-        budget = f"{self.budget_s:.6f}".rstrip("0").rstrip(".") + "s"
-        return shlex.join(["aw", "bench", *self.choices[0].words, "--scene", scene, "--budget", budget])
+        length = length_options(None, self.budget_s)
+        return shlex.join(["aw", "bench", *self.choices[0].words, "--scene", scene, *length])
 
 
 def recommend(

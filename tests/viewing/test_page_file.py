@@ -197,10 +197,6 @@ def test_runs_of_two_scenes_need_a_choice(runs: Path, tmp_path: Path) -> None:
     write_shown_run(tmp_path / "runs", other, "3dgs")
     with pytest.raises(AwError, match="give those of one"):
         view_runs([runs, tmp_path / "runs"], tmp_path / "out")
-    with pytest.raises(AwError, match="unknown scene 'hall'"):
-        view_runs([runs], tmp_path / "out", scene="hall")
-    page = view_runs([runs, tmp_path / "runs"], tmp_path / "out", scene="yard")
-    assert len(facts(page.path.read_text())["models"]) == 1
 
 
 def test_seeds_have_labels_of_their_own(runs: Path, tmp_path: Path) -> None:
@@ -372,8 +368,6 @@ def test_the_panel_names_files_and_the_command_that_trains_on(
         place = f"{above}{run.relative_to(tmp_path / 'out').as_posix()}"
         assert f"`{place}/masks`" in steps and f"`aw table {above}runs`" in steps
         assert str(tmp_path) not in text
-    chosen = facts(view_runs([run], tmp_path / "page", steps=[HOSTILE]).path.read_text())
-    assert chosen["next"] == [HOSTILE]
     change_result(run, lambda r: r.update(reproduce='aw "'))
     assert facts(view_runs([run], tmp_path / "page").path.read_text())["models"][0]["retrain"] == ""
 

@@ -33,7 +33,7 @@ from ambiguous_wild.report.cost_plots import draw_all, spread_out
 from ambiguous_wild.report.cost_recommend import recommend
 from ambiguous_wild.report.cost_report import cost_report, to_text, write_report
 from ambiguous_wild.report.cost_runs import read_cost_runs
-from tests.harness.fake_runs import failed
+from tests.harness.fake_runs import failed, save
 from tests.report.board_runs import change_result
 from tests.report.fake_cost import RISING, cost_run, curves, read, rising
 
@@ -313,6 +313,9 @@ def test_only_an_earlier_report_is_taken_away(tmp_path: Path) -> None:
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(AwError, match="no folder of runs"):
         read(tmp_path / "absent")
+    with pytest.raises(AwError, match="no run in"):
+        read(tmp_path)
+    save(tmp_path / "z", failed("b"))
     with pytest.raises(AwError, match="no finished run"):
         read(tmp_path)
     cost_run(tmp_path / "x", "a")

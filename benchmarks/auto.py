@@ -12,7 +12,6 @@ thread a run. Finished runs are kept. Writes benchmarks/results/auto.md.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -25,7 +24,7 @@ from job_queue import aw, count, exit_code, find_scenes, seed
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.harness.result_file import RESULT, read_result
-from ambiguous_wild.io.files import write_text
+from ambiguous_wild.io.files import own_json, write_text
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.simulate.presets import PRESETS
@@ -67,12 +66,11 @@ def train(scene: Scene, effects: str, out: Path, iterations: int, seeds: Sequenc
     words += ["--device", "cpu", "--iterations", str(iterations), "--no-pictures", "-o", str(folder)]
     words += [word for seed in seeds for word in ("--seed", str(seed))]
     aw(*words)  # keeps a finished run of the same configuration and scene, refuses another one
-    told = runs[0] / "effects.json"  # the plan is the same for every seed
-    said = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else {}
+    plan = own_json(runs[0] / "effects.json")  # the same for every seed
     images = [read_result(run / RESULT)["per_image"] for run in runs]
     return {
         "seeds": {m: [_mean(of_run, m) for of_run in images] for m in METRICS},
-        "effects": ",".join(said.get("effects") or []) or "none",
+        "effects": ",".join(plan.get("effects") or []) or "none",
     }
 
 
@@ -150,7 +148,6 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--iterations", type=count, default=1500)
     parser.add_argument("--jobs", type=count, default=2, help="runs at a time")
     parser.add_argument("--results", type=Path, default=RESULTS, help="where the table goes")
-    parser.add_argument("--report-only", action="store_true", help="train nothing, tabulate what is there")
     return parser.parse_args(words)
 
 

@@ -25,8 +25,10 @@ import llvmlite
 import numba
 import numpy as np
 import torch
+from job_queue import exit_code
 
 from ambiguous_wild.core import Camera
+from ambiguous_wild.harness.cell import environment
 from ambiguous_wild.io.files import atomic_path, write_json
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import read_splats
@@ -38,6 +40,7 @@ from ambiguous_wild.splat.cpu.simd import fma, splat, store
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.losses import photometric as photometric_loss
 from ambiguous_wild.splat.optim import SplatAdam
+from ambiguous_wild.viewing.model import gaussians_of
 
 RESULTS = Path(__file__).parent / "results" / "limits.json"
 RANDOM = ((30_000, 240, 136), (100_000, 504, 378), (300_000, 960, 540))
@@ -109,11 +112,7 @@ def random_model(n: int, width: int, height: int, seed: int = 0) -> tuple[Gaussi
         "sh0": rng.normal(size=(n, 3)),
         "sh_rest": 0.1 * rng.normal(size=(n, 15, 3)),
     }
-    return as_gaussians(arrays), Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
-
-
-def as_gaussians(arrays: dict[str, np.ndarray]) -> Gaussians:
-    return Gaussians(**{name: torch.from_numpy(a.astype(np.float32)) for name, a in arrays.items()})
+    return gaussians_of(arrays), Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
 
 
 def trained_model(text: str) -> tuple[str, Gaussians, Camera]:
@@ -121,7 +120,7 @@ def trained_model(text: str) -> tuple[str, Gaussians, Camera]:
     name, _, paths = text.partition("=")
     model, _, scene = paths.rpartition(",")
     train = load_scene(scene).train
-    return name, as_gaussians(read_splats(Path(model)).gaussians), train[len(train) // 2].camera
+    return name, gaussians_of(read_splats(Path(model)).gaussians), train[len(train) // 2].camera
 
 
 class Clock:
@@ -259,15 +258,8 @@ def peak_memory(n: int, width: int, height: int) -> float:
 
 
 def machine(peak: tuple[float, float]) -> dict[str, Any]:
-    model = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line
-        ]
-        model = names[0] if names else model
     return {
-        "cpu": model,
+        "cpu": environment("cpu")["cpu"],
         "llvm_target": llvmlite.binding.get_host_cpu_name(),
         "threads": threads(),
         "python": platform.python_version(),
@@ -317,4 +309,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

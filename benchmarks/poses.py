@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from job_queue import exit_code
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import environment
@@ -397,4 +398,4 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

@@ -94,7 +94,7 @@ def command(
 
     from ambiguous_wild.cli.bench import parse_budget
     from ambiguous_wild.cli.run_progress import ProgressBar
-    from ambiguous_wild.harness.ablation_study import earlier_groups, plan_study, report
+    from ambiguous_wild.harness.ablation_study import as_continued_study, earlier_groups, plan_study, report
     from ambiguous_wild.harness.cell import RunOptions
     from ambiguous_wild.harness.grid import run_cells
     from ambiguous_wild.io.files import check_output
@@ -119,6 +119,8 @@ def command(
     check_output(output / "run")
     if on == "cpu":
         prepare_cpu(threads)
+    if overwrite == "longer":
+        study = as_continued_study(study, output)
     cells = study.cells
     absent = sum(1 for row in study.rows if row.missing)
     more = f", {absent} variants cannot run here" if absent else ""

@@ -108,11 +108,6 @@ def make_command(
         )
     if not is_text(title := settings["title"]):
         raise AwError(f"--title {title!a} contains half a character; set the terminal's encoding to UTF-8")
-    same = [
-        scene for k, scene in enumerate(photos_of) if scene.resolve() in [s.resolve() for s in photos_of[:k]]
-    ]
-    if same:
-        raise AwError(f"--scene {same[0]} is given twice, so its photos would count twice; give it once")
     key = output.with_suffix(".key.json")
     for wanted in (output, key):
         check_output(wanted)
@@ -122,7 +117,16 @@ def make_command(
             f"{' and '.join(there)} {'exist' if len(there) > 1 else 'exists'}; answers to the old page could "
             "not be scored without its key; choose another -o, or replace it with --overwrite"
         )
-    asked: list[Question] = [q for scene in photos_of for q in scene_photos(scene, outline=outline)]
+    asked: list[Question] = []
+    folders: dict[str, Path] = {}  # by name of the scene
+    for folder in photos_of:
+        photos = scene_photos(folder, outline=outline)
+        if (other := folders.setdefault(photos[0].scene, folder)) is not folder:
+            raise AwError(
+                f"--scene {other} and --scene {folder} are both called {photos[0].scene}: their answers would "
+                "count as those of one scene; give it once, or rename one in its scene.json"
+            )
+        asked += photos
     if runs is not None:
         asked += render_pairs(runs, methods=methods, scenes=scenes, truth=truth)
     study = make_study(

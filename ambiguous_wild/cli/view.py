@@ -258,8 +258,10 @@ def export_command(
         return
     for label, files in reports:
         say(f"{label}: {files[0].gaussians:,} Gaussians", out=True)
-        if told := [f"{e.format}: {_transform(e)}" for e in files if e.transform != type(e.transform)()]:
-            say(f"  for the scene's coordinates (each file says so too): {'; '.join(told)}", out=True)
+        if transforms := [
+            f"{e.format}: {_transform(e)}" for e in files if e.transform != type(e.transform)()
+        ]:
+            say(f"  for the scene's coordinates (each file says so too): {'; '.join(transforms)}", out=True)
         for e in files:
             say(f"  {_line(e)}", out=True)
 

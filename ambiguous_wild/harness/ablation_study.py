@@ -24,6 +24,7 @@ from ambiguous_wild.harness.ablation_records import (
 )
 from ambiguous_wild.harness.cell import Cell
 from ambiguous_wild.harness.command_lines import option_text
+from ambiguous_wild.harness.continued import as_continued
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
 from ambiguous_wild.harness.measures import MASK_LABELS, Measure
 from ambiguous_wild.harness.result_file import (
@@ -154,6 +155,17 @@ def plan_study(
             same = "" if name == own_name else DEFAULT if name == method else name.partition("@")[2]
             rows.append(Planned(group.name, variant, tuple(cells), same_as=same))
     return Study(method, chosen, tuple(settings), default, tuple(rows))
+
+
+def as_continued_study(study: Study, output: Path) -> Study:
+    """Return the study with each cell as the continuation of its run in OUTPUT, see `as_continued`."""
+    cells = {folder: as_continued(c, folder) for c in study.cells for folder in [cell_folder(output, c)]}
+
+    def of(row: Sequence[Cell]) -> tuple[Cell, ...]:
+        return tuple(cells[cell_folder(output, cell)] for cell in row)
+
+    rows = tuple(dataclasses.replace(row, cells=of(row.cells)) for row in study.rows)
+    return dataclasses.replace(study, default=of(study.default), rows=rows)
 
 
 def _settings_of(variant: Variant, method: str, settings: Sequence[str]) -> list[str]:

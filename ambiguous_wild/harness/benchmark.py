@@ -209,6 +209,11 @@ def bench(
     engine = Engine() if engine is None else engine
     engine = engine if jobs is None else dataclasses.replace(engine, jobs=jobs)
     engine.check()
+    if engine.transfer == "store" and (overwrite == "longer" or corrections is not None):
+        raise AwError(
+            "--overwrite longer and --corrections need files that --set engine.transfer=store does not send: "
+            "leave it out, with -o on storage that all nodes share"
+        )
     metrics = [metrics] if isinstance(metrics, str | Path) else metrics
     for file in metrics:
         load_metrics(Path(file))

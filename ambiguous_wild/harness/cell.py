@@ -46,6 +46,7 @@ from ambiguous_wild.harness.start import StartFile
 from ambiguous_wild.io.corrections import CorrectionsFile
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.io.motion_points import FILE as MOTION
+from ambiguous_wild.methods.entry import second_pass_name
 from ambiguous_wild.methods.graft import Graft
 from ambiguous_wild.methods.references import reference_file
 from ambiguous_wild.methods.registry import MethodEntry, all_methods
@@ -337,7 +338,7 @@ def reproduce(cell: Cell) -> str:
     """
     method, train = cell.method, cell.train
     name = _base(method).name
-    given = method.given_as or name
+    given = method.given_as or second_pass_name(name, method.passes)
     options: list[tuple[str, object]] = [
         ("--device", cell.device.partition(":")[0]),
         ("--resolution", train.resolution),

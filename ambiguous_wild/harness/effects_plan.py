@@ -135,9 +135,8 @@ def _looking_at(scene: Scene) -> list[tuple[Camera, float]]:
     owner, cameras = scene.points.owners, []
     for index, view in enumerate(scene.views):
         if view.split == "train":
-            pose = view.camera.cam_from_world
             xyz = scene.points.xyz[owner[scene.points.track_views == index]]
-            depth = (xyz @ pose[:3, :3].T + pose[:3, 3])[:, 2]
+            depth = view.camera.to_camera(xyz)[:, 2]
             depth = depth[depth > 0]
             if len(depth) >= 5:
                 cameras.append((view.camera, float(np.median(depth))))

@@ -91,7 +91,7 @@ def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:
     try:
         meter.begin(0.0)
     except AwError:
-        meter.end(0.0)
+        meter.end()
         return program.run(task), {}
     try:
         produced = program.run(task)
@@ -100,7 +100,7 @@ def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:
             return produced, {}
         meter.look(trained)
     finally:
-        meter.end(0.0)
+        meter.end()
     return produced, {**meter.cost(trained), "cpu_s": own_s() - before}
 
 

@@ -369,13 +369,13 @@ def with_masks(plan: EffectsPlan, scene: Scene, bar: Bar = NO_BAR) -> EffectsPla
         AwError: a photo cannot be read.
     """
     colour = plan.effects(("exposure", "appearance"))
-    found = measure_occlusion(scene, colour, bar=bar)
-    plan = with_occlusion(plan, found)
-    if found.share < OCCLUSION:
+    occlusion = measure_occlusion(scene, colour, bar=bar)
+    plan = with_occlusion(plan, occlusion)
+    if occlusion.share < OCCLUSION:
         return plan
     with tempfile.TemporaryDirectory(prefix="aw-plan-") as folder:
         pair = Pair(scene, Path(folder))
-        patches = [torch.from_numpy(found.patches[place]) for place in pair.chosen]
+        patches = [torch.from_numpy(occlusion.patches[place]) for place in pair.chosen]
         psnr = []
         for masked in (True, False):
             with bar(total=ITERATIONS) as progress:

@@ -14,9 +14,10 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Required, TypedDict, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Required, TypedDict, cast, get_args
 
 import numpy as np
+from msgspec import Meta
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.core.machine import in_order, photo_threads
@@ -179,7 +180,12 @@ def register(metric: Metric) -> Metric:
         raise AwError(f"metric {metric.key!r} is built in: give yours another key")
     for field, value, right, form in (
         ("better", metric.better, metric.better in get_args(Better), "'higher', 'lower' or None"),
-        ("digits", metric.digits, type(metric.digits) is int and metric.digits >= 0, "a whole number"),
+        (
+            "digits",
+            metric.digits,
+            type(metric.digits) is int and metric.digits in range(100),
+            "a whole number",
+        ),
         (
             "needs",
             metric.needs,
@@ -228,7 +234,7 @@ class MetricRecord(TypedDict):
 
     label: str
     better: Better
-    digits: int
+    digits: Annotated[int, Meta(ge=0, le=99)]
     partial: bool
     source: str  # sha256 of its file; empty for a package's
 
@@ -242,7 +248,8 @@ def records(keys: Iterable[str]) -> dict[str, MetricRecord]:
 def register_columns(in_result: Mapping[str, MetricRecord]) -> None:
     """Register the columns of a result's own metrics from their records, without functions."""
     for key in in_result.keys() - MEASURES:
-        own_metrics.setdefault(key, Metric(key, function="", **in_result[key]))
+        fields = {k: v for k, v in in_result[key].items() if k in MetricRecord.__annotations__}
+        own_metrics.setdefault(key, Metric(key, function="", **fields))  # type: ignore[arg-type]
 
 
 class ImageRow(TypedDict, total=False):

@@ -201,7 +201,7 @@ class Meter:
         self._sample(trained_s)
         self._since = self._now()
 
-    def end(self, trained_s: float) -> None:
+    def end(self) -> None:
         """Stop measuring, after the last step or an error."""
         if self._since is not None:
             self._close()

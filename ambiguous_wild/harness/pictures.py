@@ -223,9 +223,6 @@ def _in_a_view(axes: Any, trainer: Trainer) -> None:
 
 def _pixels_in_view(xyz: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the pixels [n, 2] of the positions in front of the camera and inside its picture."""
-    local, shape = (
-        xyz @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3],
-        (camera.height, camera.width),
-    )
-    x, y = in_map(camera, local, shape)
+    shape = (camera.height, camera.width)
+    x, y = in_map(camera, camera.to_camera(xyz), shape)
     return np.stack([x, y], axis=1)[inside(x, y, shape)] + 0.5

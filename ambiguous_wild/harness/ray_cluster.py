@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import shutil
 import tempfile
 import uuid
 from collections.abc import Callable, Sequence
@@ -19,9 +20,9 @@ from typing import Any
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.callbacks import Engine
 from ambiguous_wild.harness.cell import CellReport, RunOptions
-from ambiguous_wild.harness.cell_run import error_line, is_finished, left_alone
+from ambiguous_wild.harness.cell_run import OURS, TRACEBACK, error_line, is_finished, left_alone
 from ambiguous_wild.harness.job import LOCK_WAIT_S, Job, run_job
-from ambiguous_wild.harness.result_file import RESULT, read_result
+from ambiguous_wild.harness.result_file import FAILED, RESULT, read_result
 from ambiguous_wild.io.archive import Limits, pack_folder, unpack
 from ambiguous_wild.io.files import atomic_dir, folder_lock, patient_lock
 
@@ -226,11 +227,23 @@ def run_sent(job: Job, scene_key: str, scene: bytes, limit_mb: float) -> Sent:
 def receive(sent: Sent, job: Job, limit_mb: float) -> CellReport:
     """On the machine that sent the job: unpack the run folder, whole or not at all.
 
+    A run that failed replaces nothing: an earlier run here, or its checkpoint, is worth more.
+
     Raises:
         AwError: the archive is no run folder, or another process uses that folder here.
     """
-    folder = Path(job.folder)
-    if sent.content:
-        with folder_lock(folder, "aw bench"), atomic_dir(folder) as temporary:
-            unpack(sent.content, temporary, Limits(bytes=int(limit_mb * 1e6)))
-    return sent.report
+    folder, report, limits = Path(job.folder), sent.report, Limits(bytes=int(limit_mb * 1e6))
+    if not sent.content:
+        return report
+    with folder_lock(folder, "aw bench"):
+        if report.outcome == "trained" or not folder.is_dir():
+            with atomic_dir(folder) as temporary:
+                unpack(sent.content, temporary, limits)
+                for path in folder.glob("[!.]*"):  # what a user put beside the run stays
+                    if path.name not in {*OURS, *os.listdir(temporary)}:
+                        (shutil.copytree if path.is_dir() else shutil.copy2)(path, temporary / path.name)
+        elif not (folder / RESULT).exists():
+            for name in (FAILED, TRACEBACK):
+                (folder / name).unlink(missing_ok=True)
+            unpack(sent.content, folder, limits, wanted=(FAILED, TRACEBACK).__contains__)
+    return report

@@ -130,7 +130,7 @@ def _shown(
     """Return where the other photo shows the same colour, [h, w] bool."""
     if not sees.any():
         return sees
-    local = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    local = camera.to_camera(world)
     x, y = in_map(camera, local, other.shape[:2])
     around = np.ones((3, 3), np.uint8)
     low, high = (_look_up(f(other, around), x, y, sees) for f in (cv2.erode, cv2.dilate))
@@ -165,7 +165,7 @@ def _seen(
     mask: np.ndarray | None,  # [H, W] bool, distractors
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return where the camera looks at each surface, and where it shows a distractor instead, [h, w] bool."""
-    local = world @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    local = camera.to_camera(world)
     z = local[..., 2]
     ahead = z > 1e-9
     sees = ahead.copy()

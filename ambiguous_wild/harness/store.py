@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 TEXT_OF_RUNS = (
     "status", "error", "folder", "device", "version", "code_hash", "config_hash", "scene_hash", "source",
     "options_hash", "training", "unrecorded", "timing", "timing_reason", "timing_kernel", "hardware",
-    "effects", "length", "features", "test_photos", "no_masks", "start", "metric_functions",
+    "effects", "fit", "length", "features", "test_photos", "no_masks", "start", "metric_functions",
 )  # fmt: skip
 FolderResult = tuple[Path, RunResult]  # a run folder and its result
 # config.yaml as read: absent keys and wrong types are possible, as the file may be old, damaged or edited
@@ -150,10 +150,7 @@ def _read_folder(root: Path, known: set[Path]) -> tuple[list[FolderResult], list
     """Read (results, runs without a result) below one folder but for `known` runs, and add them to these."""
     results: list[FolderResult] = []
     incomplete: list[Incomplete] = []
-    found = find_runs([root])
-    if not found:
-        raise _no_run(root)
-    for run in (run for run in found if run.resolve() not in known):
+    for run in (run for run in find_runs([root]) if run.resolve() not in known):
         known.add(run.resolve())
         try:
             results.append((run, checked_result(run)))
@@ -278,7 +275,7 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
     """Return the run folders below, each once, as one of the given folders may be inside another.
 
     Raises:
-        AwError: no such folder.
+        AwError: no such folder, or no run in one.
     """
     runs: dict[Path, Path] = {}
     for root in folders:
@@ -286,7 +283,10 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
             raise AwError(
                 f"no folder of runs {root}: give the folder that 'aw bench -o' wrote{similar_path(root)}"
             )
-        runs |= {run.resolve(): run for run in run_folders(root)}
+        below = {run.resolve(): run for run in run_folders(root)}
+        if not below:
+            raise _no_run(root)
+        runs |= below
     return list(runs.values())
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
-from ambiguous_wild.core.errors import shortlist, similar_path, unknown
+from ambiguous_wild.core.errors import shortlist, similar_path
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.labels import shown_names
@@ -74,7 +74,6 @@ class SceneModels:
 def read_models(
     paths: Sequence[Path],
     *,
-    scene: str | None = None,
     scene_folder: Path | None = None,
     labels: Sequence[str] = (),
 ) -> SceneModels:
@@ -82,7 +81,6 @@ def read_models(
 
     Args:
         paths: run folders, folders of runs, or splat files.
-        scene: name of the scene to show, if the runs are of several.
         scene_folder: where the scene lies; None = where the runs say. For splat files alone, None gives a
             scene without photos.
         labels: names and order of methods, see `labels.shown_names`.
@@ -101,18 +99,14 @@ def read_models(
     trained, more = find_models(folders if files else paths, labels)
     notes += more
     names = sorted({t.scene for t in trained})
-    if scene is not None:
-        trained = [t for t in trained if t.scene == scene]
-        if not trained:
-            raise unknown("scene", scene, names)
-    elif len(names) > 1:
+    if len(names) > 1:
         one = trained[0].run.parent.parent
         raise AwError(
             f"these runs are of {len(names)} scenes ({shortlist(names)}): give those of one, e.g. {one}"
         )
     if len({t.scene_hash for t in trained}) > 1:
         runs = shortlist(sorted(str(t.run) for t in trained), 3)
-        raise AwError(f"scene {trained[0].scene!r} differs between these runs: {runs}; name them one by one")
+        raise AwError(f"scene {names[0]!r} differs between these runs: {runs}; name them one by one")
     if any(t.half for t in trained):
         notes.append("PSNR of runs with --protocol half is that of the right half of each test photo")
     opened = open_scene(trained[0].run, scene_folder)
@@ -265,8 +259,9 @@ def _retrain_command(run: Path, result: RunResult) -> str:
         words = shlex.split(str(result.get("reproduce", "")))
     except ValueError:
         return ""
-    iterations, runs = result["cost"].get("iterations"), run.resolve().parents[2]
-    if words[:2] != ["aw", "bench"] or not iterations:
+    cost, runs = result["cost"], _folder_of_runs(run)
+    iterations = cost.get("iterations")
+    if words[:2] != ["aw", "bench"] or not iterations or "passes" in cost:  # two passes cannot go on
         return ""
     options = [
         (option, str(_from_here(Path(value), runs)) if value.startswith("/") else value)
@@ -276,6 +271,11 @@ def _retrain_command(run: Path, result: RunResult) -> str:
     options += [("-o", str(_from_here(runs, runs))), ("--iterations", str(round(1.5 * iterations)))]
     options += [("--overwrite", "longer"), ("--corrections", "corrections.json")]
     return shlex.join(["aw", "bench", *(word for pair in options for word in pair)])
+
+
+def _folder_of_runs(run: Path) -> Path:
+    """Return the folder that holds SCENE/METHOD/SEED, else the root folder: a run may be moved anywhere."""
+    return Path(*run.resolve().parts[:-3] or run.resolve().parts[:1])
 
 
 def _from_here(path: Path, runs: Path) -> Path:
@@ -293,10 +293,11 @@ def next_steps(shown: SceneModels, *, on_page: bool = True) -> list[str]:
     """
     steps: list[str] = []
     for run, model in zip(shown.runs, shown.models):
-        runs = run.resolve().parents[2]
-        place, root = str(run), str(run.parents[2])
+        runs = _folder_of_runs(run)
         if on_page:
             place, root = str(_from_here(run.resolve(), runs)), str(_from_here(runs, runs))
+        else:
+            place, root = str(run), str(run.parents[2])
         if model.masks is not None:
             steps.append(f"masks of {model.label}, white = static: `{place}/{MASKS}`")
             full = shlex.join(["aw", "masks", place, "-o", "masks"])
@@ -318,6 +319,9 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
 
     An unknown method is drawn as plain 3DGS. The run may come from a stranger: no file that its name refers
     to is imported.
+
+    Raises:
+        AwError: effects or background are damaged.
     """
     name, source = str(config.get("method", "")), str(config.get("source", ""))
     options = section(config, "options")
@@ -342,9 +346,16 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
         hooks = entry.build(from_plain(type(entry.options()), options, "options"))
     except AwError as error:  # an option of another version
         hooks, note = entry.build(entry.options()), f"{name} is drawn with its present defaults: {error}"
-    antialias = hooks.antialias or "antialias" in (config.get("effects") or ())
-    behind = section(config, "scene").get("background", hooks.background)
-    red, green, blue = (float(value) for value in behind)
+    effects, behind = (
+        config.get("effects") or (),
+        section(config, "scene").get("background", hooks.background),
+    )
+    try:
+        antialias = hooks.antialias or "antialias" in effects
+        red, green, blue = map(float, behind)
+    except (TypeError, ValueError):
+        values = f"effects {str(effects)[:40]!a}, background {str(behind)[:40]!a}"
+        raise AwError(f"{CONFIG} of a run of {name} is damaged ({values}): restore it") from None
     return RenderSettings(hooks.sh_degree, antialias, hooks.blur, (red, green, blue)), note
 
 
@@ -363,11 +374,9 @@ def view_runs(
     paths: Sequence[Path],
     output: Path,
     *,
-    scene: str | None = None,
     scene_folder: Path | None = None,
     most_gaussians: int = MAX_GAUSSIANS,
     title: str | None = None,
-    steps: Sequence[str] | None = None,
     labels: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> Page:
@@ -376,18 +385,16 @@ def view_runs(
     Args:
         paths: run folders, or folders of runs, all of one scene.
         output: folder of the page.
-        scene: name of the scene to show, if the runs are of several.
         scene_folder: where the scene lies; None = where the runs say.
         most_gaussians: a larger model is reduced to this number, with a note on the page.
         title: title of the page; None = the scene's name.
-        steps: lines of the panel "What next", see `page_text`; None = those of `next_steps`.
         labels: names and order of methods, see `labels.shown_names`.
         say: gets a line about each step.
 
     Raises:
         AwError: no run with a model, several scenes, no scene, or another page in the folder.
     """
-    shown = read_models(paths, scene=scene, scene_folder=scene_folder, labels=labels)
+    shown = read_models(paths, scene_folder=scene_folder, labels=labels)
     check_page_folder(output)
     text, models_bytes = page_text(
         shown.scene,
@@ -396,7 +403,7 @@ def view_runs(
         most_gaussians=most_gaussians,
         notes=shown.notes,
         mixed=shown.mixed,
-        next_steps=next_steps(shown) if steps is None else steps,
+        next_steps=next_steps(shown),
         say=say,
     )
     write_text(output / PAGE, text)

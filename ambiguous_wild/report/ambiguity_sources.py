@@ -268,7 +268,7 @@ def sees(
     points: np.ndarray,  # [P, 3] world
 ) -> np.ndarray:  # [P] bool
     """Return whether the camera sees each point: inside the picture, at its surface, outside the mask."""
-    local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    local = camera.to_camera(points)
     z = np.maximum(local[:, 2], 1e-9)
     cols = np.floor(np.clip(camera.fx * local[:, 0] / z + camera.cx, -1, camera.width)).astype(int)
     rows = np.floor(np.clip(camera.fy * local[:, 1] / z + camera.cy, -1, camera.height)).astype(int)

@@ -49,11 +49,11 @@ def _family(features: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", feature_family(features).lower())
 
 
-def summarise(measured: MeasuredScene, seed: int = 0) -> Summary:
+def summarise(measured: MeasuredScene) -> Summary:
     """Compute the scene's scores with 95 % intervals over photos; undefined scores are None."""
     counts = [m.counts for m in measured.photos]
-    colour, semantic = _colour(counts, seed), _semantic(measured, seed)
-    covered = am.ratio_interval([c.distractor for c in counts], [c.pixels for c in counts], seed=seed)
+    colour, semantic = _colour(counts), _semantic(measured)
+    covered = am.ratio_interval([c.distractor for c in counts], [c.pixels for c in counts])
     shares = [c.occlusion for c in counts]  # of a train photo that distractors cover
     return {
         "scene": measured.scene.name,
@@ -61,7 +61,7 @@ def summarise(measured: MeasuredScene, seed: int = 0) -> Summary:
         "masks": measured.masks.source,
         "background": measured.background.source,
         "features": measured.features,
-        "seed": seed,
+        "seed": 0,  # of the intervals
         "class": classify(colour["ambiguous"], semantic["ambiguous"]) if covered.mean else NO_DISTRACTORS,
         "doubts": _doubts(measured.masks.source, colour, semantic),
         "occlusion": {**_interval(covered), "min": min(shares), "max": max(shares)},
@@ -97,10 +97,10 @@ def classify(colour: bool | None, semantic: bool | None) -> str:
     return "colour" if colour else "semantic" if semantic else "neither"
 
 
-def _colour(counts: list[am.ColourCounts], seed: int) -> Summary:
+def _colour(counts: list[am.ColourCounts]) -> Summary:
     """Return the share of the distractor pixels whose colour is close to their background."""
     total = am.pooled(counts)
-    share = am.ratio_interval([c.close for c in counts], [c.known for c in counts], seed=seed)
+    share = am.ratio_interval([c.close for c in counts], [c.known for c in counts])
     return {
         **_interval(share),
         "threshold": am.COLOUR_THRESHOLD,
@@ -112,16 +112,16 @@ def _colour(counts: list[am.ColourCounts], seed: int) -> Summary:
     }
 
 
-def _semantic(measured: MeasuredScene, seed: int) -> Summary:
+def _semantic(measured: MeasuredScene) -> Summary:
     """Return the similarity of distractors to the static scene."""
     photos = [m.matches for m in measured.photos if m.matches]
     # a mean as a ratio to the number of photos, so that it is missing, and no error, without any
-    best = am.ratio_interval([sem.photo_cosine(p) for p in photos], [1.0] * len(photos), seed=seed)
+    best = am.ratio_interval([sem.photo_cosine(p) for p in photos], [1.0] * len(photos))
     score, limit = best, sem.AMBIGUOUS_ABOVE
     if measured.whitened:
         alike = [sum(m.pixels for m in p if m.cosine >= measured.usual) for p in photos]
         pixels = [sum(m.pixels for m in p) for p in photos] if not math.isnan(measured.usual) else []
-        score, limit = am.ratio_interval(alike[: len(pixels)], pixels, seed=seed), sem.LOOKALIKE_ABOVE
+        score, limit = am.ratio_interval(alike[: len(pixels)], pixels), sem.LOOKALIKE_ABOVE
     anchors = measured.anchors
     return {
         **_interval(score),

@@ -10,7 +10,7 @@ from typing import Literal
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.grouping import grouped
-from ambiguous_wild.harness.store import run_folders
+from ambiguous_wild.harness.store import find_runs
 from ambiguous_wild.io.files import folder_lock, sha256_file, sweep
 from ambiguous_wild.report import board_pictures
 from ambiguous_wild.report.board import (
@@ -70,7 +70,7 @@ def add(
     Raises:
         AwError: there is no run, or the board is damaged or in use.
     """
-    runs = _find(paths)
+    runs = find_runs(paths)
     with folder_lock(board, "aw leaderboard add"):
         if not dry:
             sweep(measured(board))
@@ -95,18 +95,6 @@ def add(
                 write_board(board, merged)
                 board_pictures.keep(board, accepted, images)  # after the runs: every picture has a run
     return [reports[run] for run in sorted(runs)]
-
-
-def _find(paths: Sequence[Path]) -> set[Path]:
-    runs: set[Path] = set()
-    for path in paths:
-        if not path.is_dir():
-            raise AwError(f"no run folder {path}: give a folder that 'aw bench -o' wrote")
-        below = list(run_folders(path))
-        if not below:
-            raise AwError(f"no run in {path}: 'aw bench --method NAME --scene SCENE -o {path}' makes one")
-        runs.update(below)
-    return runs
 
 
 def _merge(

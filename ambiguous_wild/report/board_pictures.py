@@ -16,6 +16,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
+from ambiguous_wild.harness.result_file import render_path
 from ambiguous_wild.harness.trained_models import MASKS
 from ambiguous_wild.io.files import atomic_path, sha256_file, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
@@ -33,7 +34,7 @@ from ambiguous_wild.report.board import (
     unguard,
     unique_slug,
 )
-from ambiguous_wild.report.board_verify import RENDERS, VerifiedRun
+from ambiguous_wild.report.board_verify import VerifiedRun
 
 INDEX = "index.csv"
 OLD = (  # columns of an index of earlier versions, which kept no masks: every picture is of kind "test"
@@ -142,8 +143,7 @@ class BoardPictures:
             if scene is not None:
                 path = next(v.image_path for v in scene.test if v.name == name)
                 self.write(render.photo, _jpeg(path))
-            path = (run.run / RENDERS / name).with_suffix(".png")
-            self.write(render, _jpeg(path), e.seed, run.psnr[name])
+            self.write(render, _jpeg(render_path(run.run, name)), e.seed, run.psnr[name])
         if scene is None:
             return
         views = {v.name: v for v in scene.train}

@@ -15,7 +15,7 @@ from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain
 from ambiguous_wild.datasets.suites import simulated_dataset
-from ambiguous_wild.harness.command_lines import option_text
+from ambiguous_wild.harness.command_lines import length_options, option_text
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
 from ambiguous_wild.harness.trained_models import Opened, open_scene
 from ambiguous_wild.io.files import own_json
@@ -101,10 +101,7 @@ def command_words(config: RunConfig, recorded: str = "") -> list[str]:
     train = config["train"]
     words: list[object] = ["aw", "bench", *_method(config, recorded)]
     words += ["--scene", config["scene"].get("name"), "--seed", train["seed"]]
-    if train.get("budget_s") is None:
-        words += ["--iterations", train.get("iterations")]
-    else:
-        words += ["--budget", f"{train['budget_s']:g}s"]
+    words += length_options(train.get("iterations"), train.get("budget_s"))
     for flag, value, usual in (
         ("--resolution", train.get("resolution"), "auto"),
         ("--max-gaussians", train.get("max_gaussians"), None),

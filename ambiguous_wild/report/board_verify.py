@@ -20,6 +20,7 @@ from ambiguous_wild.harness.measures import ImageRow, Metric, measure, measure_i
 from ambiguous_wild.harness.result_file import (
     FAILED,
     MODEL,
+    RENDERS,
     RESULT,
     RunConfig,
     RunResult,
@@ -50,7 +51,6 @@ from ambiguous_wild.report.board_reproduce import (
     setting,
 )
 
-RENDERS = Path("renders") / "test"
 REQUIRED = ("psnr", "ssim", "ssim_inria")  # always measurable: they need only the two pictures
 RESTORE = "restore the files, or run it again with 'aw bench --overwrite always'"
 

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.errors import AwError, shortlist
 from ambiguous_wild.core.grouping import grouped
+from ambiguous_wild.harness.command_lines import length_options
 from ambiguous_wild.methods.registry import knows_truth
 from ambiguous_wild.metrics import stats
 from ambiguous_wild.report.cost_curves import Curve, curves_of, duration, scenes_of, summary
@@ -61,8 +62,8 @@ class Recommendation:
 
     def command(self, scene: str) -> str:
         """Return the command that trains the recommended setting."""
-        budget = f"{self.budget_s:.6f}".rstrip("0").rstrip(".") + "s"
-        return shlex.join(["aw", "bench", *self.choices[0].words, "--scene", scene, "--budget", budget])
+        length = length_options(None, self.budget_s)
+        return shlex.join(["aw", "bench", *self.choices[0].words, "--scene", scene, *length])
 
 
 def recommend(
@@ -102,6 +103,9 @@ def recommend(
             f"no run was trained within {reference:.0f} s (the shortest took {shortest:.0f} s): "
             "ask for a longer time, or add runs with a shorter one: aw bench --budget 30s"
         )
+    measured, values = values, comparable(values)
+    if apart := sorted({name for name, _ in measured} - {name for name, _ in values}):
+        notes.append(f"not compared, as they share no scene with the others: {shortlist(apart)}")
     parts, rest = additive(values)
     if own and len(values) < 2:
         notes.append(f"{scene} was measured with one setting only")
@@ -128,6 +132,16 @@ def value_at(curves: Sequence[Curve], scene: str, seconds: float) -> float:
         return math.nan
     at, psnr = np.log([end[0] for end in ends]), np.array([end[1] for end in ends])
     return float(np.interp(math.log(seconds), at, psnr))
+
+
+def comparable(values: dict[tuple[str, str], float]) -> dict[tuple[str, str], float]:
+    """Return the largest part of the PSNR by (setting, scene) whose settings common scenes connect."""
+    parts: list[set[tuple[str, str]]] = []
+    for key in values:
+        joined = [part for part in parts if any(key[0] == n or key[1] == s for n, s in part)]
+        parts = [part for part in parts if part not in joined] + [{key}.union(*joined)]
+    largest = max(parts, key=len)
+    return {key: value for key, value in values.items() if key in largest}
 
 
 def additive(values: dict[tuple[str, str], float]) -> tuple[dict[str, float], dict[str, float]]:

@@ -100,7 +100,7 @@ class Inpainting:
                 continue
             rows, columns = rows * STRIDE, columns * STRIDE
             depth, seen = depths[index][rows, columns], np.zeros(len(rows), bool)
-            world = _world(view.camera, columns + 0.5, rows + 0.5, depth)
+            world = view.camera.unproject(np.stack([columns, rows], axis=1) + 0.5, depth)
             for other, camera in enumerate(cameras):
                 if other != index:
                     seen |= self._shows(camera, depths[other], self._keeps[views[other].name], world)
@@ -113,13 +113,6 @@ class Inpainting:
         """Return which points [N, 3] a camera shows: in its frame, behind nothing, and not masked."""
         pixels, z = camera.project(world)
         x, y = pixels.T
-        inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        inside = camera.has(pixels, z)
         column, row = np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int)
         return inside & (keep[row, column] > 0) & (z <= BEHIND * depth[row, column])
-
-
-def _world(camera: Camera, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Return the points [N, 3] of the world that pixels [N] see at these depths."""
-    local = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(depth)], axis=-1)
-    rotation, translation = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
-    return (local * depth[:, None] - translation) @ rotation

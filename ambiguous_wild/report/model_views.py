@@ -56,6 +56,7 @@ FOLDER = "export"  # in a run folder
 FIRST_PAGE_S = 10.0  # of training until the first page of a run that is trained
 LONGEST_PAUSE_S = 60.0  # of training between two pages
 LEAST_PAUSE = 10.0  # least pause, in times that a page takes
+GIF_SECONDS, GIF_FRAMES, GIF_WIDTH = 4.0, 48, 640  # px
 GAUSSIANS_WHILE_TRAINING = 60_000  # of a model in such a page, which is to be written within a second or two
 
 
@@ -126,7 +127,7 @@ def export_runs(
         try:
             if run is not None:
                 scene = open_scene(run, scene_folder)
-            elif run is None and scene_folder is not None:
+            elif scene_folder is not None:
                 scene = load_scene(scene_folder)
                 model = model.within(scene.transform)
         except AwError as error:
@@ -160,9 +161,6 @@ def _file_names(scenes: Sequence[str], labels: Sequence[str]) -> list[str]:
     return names
 
 
-GIF_FPS = 12.0
-
-
 @dataclass(frozen=True)
 class Video:
     """The video that was written."""
@@ -184,9 +182,6 @@ def video_runs(
     width: int | None = None,
     columns: int | None = None,
     gif: Path | None = None,
-    gif_seconds: float = 4.0,
-    gif_width: int = 640,
-    scene: str | None = None,
     scene_folder: Path | None = None,
     labels: Sequence[str] = (),
     threads: int | None = None,
@@ -202,9 +197,7 @@ def video_runs(
         seconds, fps: length and frames per second.
         width: width of each method's picture, px; None = that of the photos.
         columns: number of pictures in a row.
-        gif: path of an animation, the video played faster so that it lasts `gif_seconds`; None = none.
-        gif_seconds, gif_width: length and width in px of the animation.
-        scene: name of the scene to show, if the runs are of several.
+        gif: path of an animation, the video played faster so that it lasts `GIF_SECONDS`; None = none.
         scene_folder: where the scene lies; None = where the runs say.
         labels: names and order of methods, see `labels.shown_names`.
         threads: threads of the kernels; None = all cores.
@@ -221,7 +214,7 @@ def video_runs(
     frames = round(seconds * fps)
     if frames < 2:
         raise AwError(f"{seconds:g} seconds at {fps:g} frames per second are fewer than two frames")
-    shown = read_models(paths, scene=scene, scene_folder=scene_folder, labels=labels)
+    shown = read_models(paths, scene_folder=scene_folder, labels=labels)
     for wanted in (output, *([gif] if gif else [])):
         check_output(wanted)
     for note in shown.notes:
@@ -232,15 +225,12 @@ def video_runs(
     say(f"drawing {frames} frames of {'; '.join(labels)}")
     begin = time.perf_counter()
     kept: list[Frame] = []
-    chosen = {
-        round(k * (frames - 1) / max(1, round(gif_seconds * GIF_FPS) - 1))
-        for k in range(round(gif_seconds * GIF_FPS))
-    }
+    chosen = {round(k * (frames - 1) / (GIF_FRAMES - 1)) for k in range(GIF_FRAMES)}
 
     def watched() -> Iterator[Frame]:
         for number, frame in enumerate(draw_frames(shown.models, cameras, columns=columns, tick=tick)):
             if gif is not None and number in chosen:
-                kept.append(narrowed(frame, gif_width))
+                kept.append(narrowed(frame, GIF_WIDTH))
             yield frame
             if number == 2:  # two are written, and most of what only the first frames take is over
                 spent = time.perf_counter() - begin
@@ -248,7 +238,7 @@ def video_runs(
 
     written = write_mp4(output, watched(), fps)
     if gif is not None:
-        write_gif(gif, kept, len(kept) / gif_seconds)
+        write_gif(gif, kept, len(kept) / GIF_SECONDS)
     return Video(output, gif, written, written / fps, labels)
 
 
@@ -365,7 +355,6 @@ def watch(
     device: str = "auto",
     host: str = "127.0.0.1",
     port: int = 8080,
-    paused: bool = False,
     say: Callable[[str], None] = lambda text: None,
     view: LiveView | None = None,
 ) -> BenchReport:
@@ -377,14 +366,13 @@ def watch(
         output: folder of the run, as `aw bench -o`; a stopped run is resumed.
         iterations, max_gaussians, seed, threads, device: as in `bench`.
         host, port: address of the page.
-        paused: pause after the first step.
         say: gets the address and the outcome.
         view: a view to use instead of a new one; it is not closed.
 
     Raises:
         AwError: viser is missing, the port is taken, or the run failed.
     """
-    shown = LiveView(host, port, paused=paused) if view is None else view
+    shown = LiveView(host, port) if view is None else view
     try:
         say(f"watch it at http://{host}:{shown.port}")
         report = bench(

@@ -220,9 +220,9 @@ def _missing(runs: Runs, columns: Sequence[Measure]) -> list[str]:
             who = shortlist(dict.fromkeys(f"{r.method} on {r.scene}" for r in others))
             lines.append(f"missing: {column.key} for {who}: it was not measured; 'aw rescore' adds it")
         gaps = images[images["value"].isna()]
-        residual_mask = [r for r in gaps.itertuples() if (r.scene, r.method, r.seed) not in explained]
-        if residual_mask:
-            names = [f"{r.image} ({r.method} on {r.scene})" for r in residual_mask]
+        unexplained = [r for r in gaps.itertuples() if (r.scene, r.method, r.seed) not in explained]
+        if unexplained:
+            names = [f"{r.image} ({r.method} on {r.scene})" for r in unexplained]
             lines.append(f"missing: {column.key}, no reason given, for {shortlist(names)}")
     return lines
 

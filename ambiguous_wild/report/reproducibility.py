@@ -288,29 +288,31 @@ def _commands(runs: Sequence[_Run]) -> list[str]:
     return [*before, *benches]
 
 
-def to_text(said: Statement) -> str:
+def to_text(statement: Statement) -> str:
     """Return a paragraph, and the commands below it."""
-    lines = [textwrap.fill(" ".join(said.sentences), WIDTH, break_long_words=False, break_on_hyphens=False)]
-    lines += ["", *(f"    {line}" for line in said.commands)] if said.commands else []
+    lines = [
+        textwrap.fill(" ".join(statement.sentences), WIDTH, break_long_words=False, break_on_hyphens=False)
+    ]
+    lines += ["", *(f"    {line}" for line in statement.commands)] if statement.commands else []
     return "\n".join(lines) + "\n"
 
 
-def to_markdown(said: Statement) -> str:
+def to_markdown(statement: Statement) -> str:
     """Return a paragraph, and the commands in a block of code."""
-    lines = [markdown_text(" ".join(said.sentences))]
-    lines += ["", "```bash", *said.commands, "```"] if said.commands else []
+    lines = [markdown_text(" ".join(statement.sentences))]
+    lines += ["", "```bash", *statement.commands, "```"] if statement.commands else []
     return "\n".join(lines) + "\n"
 
 
-def to_latex(said: Statement) -> str:
+def to_latex(statement: Statement) -> str:
     """Return a paragraph, and the commands in typewriter that breaks between words; needs no package."""
-    lines = [latex_text(" ".join(said.sentences))]
-    if said.commands:
+    lines = [latex_text(" ".join(statement.sentences))]
+    if statement.commands:
         lines += ["", r"\begin{flushleft}\footnotesize\ttfamily"]
         # two hyphens, or a quotation mark, are other signs in the typewriter of some encodings
         commands = (
             latex_text(line).replace("--", "-{}-").replace("'", r"\textquotesingle{}")
-            for line in said.commands
+            for line in statement.commands
         )
         lines += [r"\par ".join(f"{line}\n" for line in commands).rstrip("\n"), r"\end{flushleft}"]
     return "\n".join(lines) + "\n"

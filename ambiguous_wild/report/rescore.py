@@ -55,11 +55,8 @@ def rescore(folders: Sequence[Path], *, scene: Path | None = None) -> list[Resco
     Raises:
         AwError: no such folder, or no run in it.
     """
-    runs = find_runs(folders)
-    if not runs:
-        raise AwError(f"no run in {', '.join(map(str, folders))}: 'aw bench -o' makes one")
     outcomes, opened = [], Opened()
-    for run in runs:
+    for run in find_runs(folders):
         try:
             outcomes.append(_rescore(run, scene, opened))
         except AwError as error:

@@ -121,7 +121,8 @@ def _own(runs: Runs, hashes: Mapping[str, str]) -> tuple[list[MethodScores], dic
             values["mask_iou"] = run.mask_iou
         method.scenes.setdefault(run.scene, {})[run.seed] = values
         config: RunConfig = read_config(Path(run.folder))  # type: ignore[assignment]
-        settings.setdefault(run.scene, set()).add(setting(config, chosen_by_plan(Path(run.folder))))
+        if "train" in config:  # else it is absent or damaged
+            settings.setdefault(run.scene, set()).add(setting(config, chosen_by_plan(Path(run.folder))))
     order = [methods[name] for name in runs.rows() if name in methods]
     lines = [f"left out, of other poses, photos or size of the scene: {shortlist(other)}"] if other else []
     return order, settings, lines

@@ -99,7 +99,6 @@ def measure_likeness(scene: Scene) -> Likeness:
             f"{scene.root}: the sparse model has too few tracks to measure colours; build the scene from "
             "its photos with 'aw build-scene'"
         )
-    photos = [load_image_float(view.image_path) for view in scene.train]
     step = max(-(-len(scene.train) // MAX_PHOTOS), 1)
     noises, smaller, sharp = [], [], []
     for view in scene.train[::step]:
@@ -120,7 +119,7 @@ def measure_likeness(scene: Scene) -> Likeness:
         factor=int(scene.info.get("loaded_factor", 1)),
         focal=float(np.median([0.5 * (c.fx + c.fy) / math.hypot(c.width, c.height) for c in cameras])),
         arc_deg=arc_of(np.array([camera.cam_from_world[2, :3] for camera in cameras])),
-        evidence=measure(scene, photos),
+        evidence=measure(scene, (load_image_float(view.image_path) for view in scene.train)),
         noise=noise * float(np.median(smaller)) if noise >= NOISE else 0.0,
         soft=float(np.mean(np.array(sharp) < BLUR_RATIO * np.median(sharp))),
         moving=(float(low), float(np.mean(shares)) if shares else math.nan, float(high)),

@@ -80,7 +80,7 @@ def train(trainer: Trainer, tick: Tick | None = None) -> None:
                     last_save = time.monotonic()
     finally:
         if meter is not None:
-            meter.end(trainer.clock.now())
+            meter.end()
 
 
 def advance(trainer: Trainer, tick: Tick | None = None) -> None:

@@ -135,39 +135,39 @@ def moved(gaussians: Arrays, of: SceneTransform, to: SceneTransform) -> Arrays:
     if of == to:
         return gaussians
     factor, shift = to.scale / of.scale, to.rotation @ np.subtract(of.centre, to.centre) * to.scale
-    turn = to.rotation @ of.rotation.T
-    placed = {**gaussians, "means": (factor * gaussians["means"] @ turn.T + shift).astype(np.float32)}
+    rotation = to.rotation @ of.rotation.T
+    placed = {**gaussians, "means": (factor * gaussians["means"] @ rotation.T + shift).astype(np.float32)}
     placed["log_scales"] = (gaussians["log_scales"] + np.log(factor)).astype(np.float32)
     if of.quat != to.quat:
-        placed["quats"] = _turned_quats(gaussians["quats"], turn)
-        placed["sh_rest"] = _turned_harmonics(gaussians["sh_rest"], turn)
+        placed["quats"] = _rotated_quats(gaussians["quats"], rotation)
+        placed["sh_rest"] = _rotated_harmonics(gaussians["sh_rest"], rotation)
     return placed
 
 
-def _turned_quats(quats: np.ndarray, turn: np.ndarray) -> np.ndarray:
+def _rotated_quats(quats: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
-    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return (quats.astype(np.float64) @ left.T).astype(np.float32)
 
 
-def _turned_harmonics(rest: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Turn harmonics [N, K, 3]: each degree is mixed within itself so that colours turn with the model."""
+def _rotated_harmonics(rest: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Rotate harmonics [N, K, 3]: each degree is mixed within itself, so colours rotate with the model."""
     from ambiguous_wild.splat.cpu.project import basis
 
     degree = round((rest.shape[1] + 1) ** 0.5) - 1
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    basis_turned, basis_now = np.empty((2, rest.shape[1], len(directions)))
-    for values, seen in ((basis_turned, directions), (basis_now, directions @ turn)):
+    basis_rotated, basis_now = np.empty((2, rest.shape[1], len(directions)))
+    for values, seen in ((basis_rotated, directions), (basis_now, directions @ rotation)):
         getattr(basis, "py_func", basis)(*seen.T, degree, values)  # for all directions at once
-    turned = rest.astype(np.float64)
+    rotated = rest.astype(np.float64)
     for k in range(1, degree + 1):
         of = slice(k * k - 1, (k + 1) ** 2 - 1)
-        mixing = np.linalg.lstsq(basis_turned[of].T, basis_now[of].T, rcond=None)[0]
-        turned[:, of] = np.einsum("jk,nkc->njc", mixing, turned[:, of])
-    return turned.astype(np.float32)
+        mixing = np.linalg.lstsq(basis_rotated[of].T, basis_now[of].T, rcond=None)[0]
+        rotated[:, of] = np.einsum("jk,nkc->njc", mixing, rotated[:, of])
+    return rotated.astype(np.float32)
 
 
 def gaussians_of(arrays: Arrays) -> Gaussians:

@@ -54,7 +54,7 @@ def orbit(scene: Scene, frames: int, size: tuple[int, int]) -> list[Camera]:
     x = away / size_of if size_of > 1e-9 else np.cross(space.up, [1.0, 0.3, 0.2])
     x = x / np.linalg.norm(x)
     return [
-        fitted(first, size, _looking(center, space.middle, space.up))
+        fitted(first, size, _look_at(center, space.middle, space.up))
         for center in _circle(space.middle, space.up, x, space.distance, frames)
     ]
 
@@ -86,7 +86,7 @@ def scene_around(model: ViewedModel) -> Scene:
     lens = Camera(_WIDTH, _HEIGHT, _WIDTH, _WIDTH, _WIDTH / 2, _HEIGHT / 2, np.eye(4))
     views = []
     for k, center in enumerate(_circle(middle, up, first, _AWAY * size, _VIEWS)):
-        camera = replace(lens, cam_from_world=_looking(center, middle, up))
+        camera = replace(lens, cam_from_world=_look_at(center, middle, up))
         views.append(View(f"render_{k}.png", NO_PHOTO, camera, "test" if k == 0 else "train"))
     points = SparsePoints.without_tracks(xyz)
     return centred(Scene(model.ply.parent, model.label, tuple(views), points))
@@ -199,7 +199,7 @@ def _smooth(keys: Sequence[Camera], frames: int, size: tuple[int, int]) -> list[
     ]
 
 
-def _looking(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+def _look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return cam_from_world of a camera at `center` that looks at `target`, OpenCV axes."""
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(forward, up)

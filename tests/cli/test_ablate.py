@@ -69,5 +69,10 @@ def test_a_study_is_trained_once_and_tabulated(scene, plugin, tmp_path):
     ]  # fmt: skip
     made_by = json.loads((tmp_path / "ablation.json").read_text())["made_by"]
     assert made_by.endswith("--group length --group size")
+    words[words.index("20")] = "30"
+    longer = aw("ablate", *words, "--overwrite", "longer")
+    assert longer.returncode == 0 and longer.stderr.count("finished before, kept") == 0, longer.stderr
+    cost = json.loads((tmp_path / "scene" / "mine@size-few" / "seed0" / "metrics.json").read_text())["cost"]
+    assert cost["iterations"] == 30
     # Other settings get a report of their own.
     assert "with what" not in aw("ablate", *words[:-1], "length", "--set", "mine.stop=700").stderr

@@ -167,6 +167,8 @@ def typed(text: str) -> Cell:
         ("refinesplat", ["refinesplat.lambda_cr=0.125", "refinesplat.density.merge_every=0"], {}),
         ("refinesplat", [], {"effects": "exposure,antialias", "protocol": "half"}),
         ("3dgs@mask=refinesplat", ["refinesplat.lambda_cr=0.5"], {}),
+        ("dronesplat+2passes", ["dronesplat.min_mask_start=10"], {}),
+        ("3dgs@mask=dronesplat+2passes", [], {}),
     ],
 )
 def test_the_command_of_a_result_makes_the_same_cell(

@@ -13,12 +13,13 @@ from click.testing import CliRunner
 from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import job as jobs
-from ambiguous_wild.harness.cell import RunOptions
+from ambiguous_wild.harness.cell import CellReport, RunOptions
 from ambiguous_wild.harness.cell_run import left_alone
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.ray_cluster import receive, run_sent, send_scene
+from ambiguous_wild.harness.ray_cluster import Sent, receive, run_sent, send_scene
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.harness.session import run_in_processes
+from ambiguous_wild.io.archive import pack_folder
 from ambiguous_wild.methods import registry
 from ambiguous_wild.splat.train_config import TrainConfig
 from tests.tiny_scene import write_tiny_scene
@@ -208,6 +209,22 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
     assert left_alone(report.folder, "changed", {**job.config, "source": "0" * 64}) is None
     assert [p.name for p in (tmp_path / "node").rglob("scene")] == ["scene"]
     assert list((tmp_path / "node").rglob("run-*")) == []
+    (report.folder / "notes.txt").write_text("mine")
+    again = receive(run_sent(job, key, content, 10.0), job, 10.0)
+    assert again.outcome == "trained" and (report.folder / "notes.txt").read_text() == "mine"
+    (report.folder / "metrics.json").unlink()
+    (report.folder / "checkpoint").mkdir()
+    node = tmp_path / "node" / "failed"
+    node.mkdir()
+    for name in ("failed.json", "config.yaml"):
+        (node / name).write_text(name)
+    (report.folder / "failed.json").write_text("of the attempt before")
+    failed = Sent(CellReport(report.folder, "failed", error="no memory"), pack_folder(node, 1.0))
+    before = (report.folder / "config.yaml").read_bytes()
+    assert receive(failed, job, 10.0).outcome == "failed"
+    assert (report.folder / "checkpoint").is_dir() and (report.folder / "notes.txt").is_file()
+    assert (report.folder / "failed.json").read_text() == "failed.json"
+    assert (report.folder / "config.yaml").read_bytes() == before
     with pytest.raises(AwError, match=r"engine\.transfer_limit"):
         send_scene(scene, 0.001)
 
@@ -226,6 +243,10 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
         (["--engine", "slurm"], "'local', 'ray'"),
         pytest.param(
             ["--engine", "ray", "--address", "auto", "--jobs", "2"], "--jobs is for this machine",
+            marks=pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed"),
+        ),
+        pytest.param(
+            ["--engine", "ray", "--set", "engine.transfer=store", "--overwrite", "longer"], "does not send",
             marks=pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed"),
         ),
     ],

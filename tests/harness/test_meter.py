@@ -52,7 +52,7 @@ def measured(m: Meter, m_work, seconds: float = 40.0, **how: float) -> tuple[str
     m.begin(0.0)
     m_work(seconds, **how)
     m.look(seconds)
-    m.end(seconds)
+    m.end()
     return m.verdict(seconds)
 
 
@@ -78,7 +78,7 @@ def test_a_load_that_others_brought_once_is_not_forgotten(tmp_path, monkeypatch)
     for k in range(4):
         here.work(10.0, others=2.0 if k == 0 else 0.0)
         m.look(10.0 * (k + 1))
-    m.end(40.0)
+    m.end()
     assert m.verdict(40.0) == ("contended", "other programs used 0.5 of 4 processors")
 
 
@@ -87,7 +87,7 @@ def sampled(m: Meter, here: Machine, seconds: int) -> tuple[str, str]:
     for k in range(1, seconds + 1):
         here.work(1.0)
         m.look(float(k))
-    m.end(float(seconds))
+    m.end()
     return m.verdict(float(seconds))
 
 
@@ -134,7 +134,7 @@ def test_load_slows_what_is_serial_less_and_cancels_out(tmp_path, monkeypatch, p
         m.begin(0.0)
         here.wall, here.own = here.wall + wall, here.own + 30.0 + parallel_s
         m.look(wall)
-        m.end(wall)
+        m.end()
         cost = m.cost(wall)
         # busy, the same work in parallel is a larger share of the time
         share = parallel_s * 2.0 / two / wall
@@ -168,7 +168,7 @@ def test_calibrations_come_often_at_first_and_every_fifteen_seconds_later(tmp_pa
         for k in range(1, round(total / step) + 1):
             if m.due(k * step, k * step / total):
                 m.look(k * step)
-        m.end(total)
+        m.end()
         times = [sample[0] for sample in m.samples]
         assert fewest <= len(times) <= most
         assert times[0] == 0.0 and times[-1] == pytest.approx(total)
@@ -182,13 +182,13 @@ def test_the_state_of_a_meter_goes_on_after_a_kill(tmp_path, monkeypatch):
     m.look(20.0)
     here.work(10.0, others=2.0)
     state = m.state_dict()
-    m.end(30.0)
+    m.end()
     other = meter(tmp_path)
     other.load_state_dict(state)
     other.begin(30.0)
     here.work(10.0)
     other.look(40.0)
-    other.end(40.0)
+    other.end()
     assert other.verdict(40.0) == ("contended", "other programs used 1.5 of 4 processors")
     assert [sample[0] for sample in other.samples] == [0.0, 20.0, 30.0, 40.0]
 

@@ -146,7 +146,12 @@ def test_the_command_tells_each_run_and_fails_where_one_is_refused(
     assert isinstance(done.exception, AwError) and "1 of 2 runs refused" in str(done.exception)
     assert "added" in done.output and "lpips_alex" in done.output
     (empty := tmp_path / "empty").mkdir()
-    for folder, words in ((empty, "no run in"), (tmp_path / "absent", "no folder of runs")):
+    photos = scene / "images"
+    for folder, words in (
+        (empty, "no run in"),
+        (photos, "holds photos"),
+        (tmp_path / "absent", "no folder of runs"),
+    ):
         error = CliRunner().invoke(command, [str(folder)]).exception
         assert isinstance(error, AwError) and words in str(error)
 

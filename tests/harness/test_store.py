@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.harness.result_file import read_result, write_result
 from ambiguous_wild.harness.store import read_runs
 from tests.harness.fake_runs import failed, fake_result, save, start
@@ -62,6 +63,20 @@ def test_numpy_numbers_are_written_as_numbers(tmp_path: Path) -> None:
     assert found["facts"] == {"on": True}
 
 
+GLARE = {"label": "glare", "better": "lower", "digits": 2, "partial": False, "source": ""}
+
+
+def test_a_metric_of_a_later_version_is_shown(tmp_path: Path) -> None:
+    images = [{"name": "0.png", "glare_of_later": 3.0}]
+    result = {
+        **fake_result("3dgs", per_image=images),
+        "metrics": {"glare_of_later": {**GLARE, "later": True}},
+    }
+    (tmp_path / "m.json").write_text(json.dumps(result))
+    read_result(tmp_path / "m.json")
+    assert measure("glare_of_later").better == "lower"
+
+
 @given(st.floats(allow_nan=False))
 def test_every_number_survives(value: float) -> None:
     import tempfile
@@ -90,6 +105,7 @@ def test_every_number_survives(value: float) -> None:
         ({"per_image": [{"name": "a", "of_a_plugin": [1.0]}]}, "got `array`"),
         ({"missing": {"ssim": None}}, r"\$\.missing"),
         ({"masks": {"iou": "x"}}, r"\$\.masks\.iou"),
+        ({"metrics": {"glare": {**GLARE, "digits": -1}}}, r"\.digits|metrics"),
         ({"cost": {"fps": "fast"}}, r"\$\.cost\.fps"),
         ({"cost": []}, r"\$\.cost"),
     ],

@@ -33,7 +33,7 @@ from ambiguous_wild.report.cost_plots import draw_all, spread_out
 from ambiguous_wild.report.cost_recommend import recommend
 from ambiguous_wild.report.cost_report import cost_report, to_text, write_report
 from ambiguous_wild.report.cost_runs import read_cost_runs
-from tests.harness.fake_runs import failed
+from tests.harness.fake_runs import failed, save
 from tests.report.board_runs import change_result
 from tests.report.fake_cost import RISING, cost_run, curves, read, rising
 
@@ -137,6 +137,14 @@ def test_what_started_elsewhere_is_not_recommended(tmp_path: Path) -> None:
     assert "differ in their effects (a: skybox; b: none)" in notes
     with pytest.raises(AwError, match="nothing can be recommended: runs on yard differ in start"):
         recommend(runs.runs, "yard", 60.0)
+
+
+def test_settings_that_share_no_scene_are_not_compared(tmp_path: Path) -> None:
+    for method, scene, psnr in (("a", "yard", 30.0), ("b", "porch", 20.0), ("c", "porch", 21.0)):
+        cost_run(tmp_path, method, scene, psnr=(psnr,))
+    found = recommend(read(tmp_path).runs, "square", 600.0)
+    assert [choice.method for choice in found.choices] == ["c", "b"]
+    assert "not compared, as they share no scene with the others: a" in found.notes
 
 
 def test_plans_of_one_scene_that_differ_make_no_seeds(tmp_path: Path) -> None:
@@ -305,6 +313,9 @@ def test_only_an_earlier_report_is_taken_away(tmp_path: Path) -> None:
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(AwError, match="no folder of runs"):
         read(tmp_path / "absent")
+    with pytest.raises(AwError, match="no run in"):
+        read(tmp_path)
+    save(tmp_path / "z", failed("b"))
     with pytest.raises(AwError, match="no finished run"):
         read(tmp_path)
     cost_run(tmp_path / "x", "a")

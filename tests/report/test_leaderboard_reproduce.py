@@ -80,6 +80,8 @@ def test_a_default_that_depends_on_the_machine_is_named(method: str, named: set[
     }
     words = shlex.split(command(config))
     assert {words[i + 1] for i, word in enumerate(words) if word == "--set"} == named
+    for seconds, budget in ((1234567.0, "1234567s"), (83.123456, "83.123456s")):
+        assert f"--budget {budget}" in command(config | {"train": {"seed": 0, "budget_s": seconds}})
     corrected = command(config | {"corrections": {"sha256": "a" * 64}})
     assert "--corrections CORRECTIONS.json" in corrected and "--corrections" not in words
 

@@ -126,7 +126,7 @@ def test_failures_and_runs_without_settings_are_named(runs, tmp_path: Path) -> N
     assert "1 run failed or did not end (absgs on scene)" in text
     assert "The command of 1 of 3 runs is not known" in text
     (tmp_path / "none").mkdir()
-    assert "no finished run below" in aw("statement", tmp_path / "none").stderr
+    assert "no run in" in aw("statement", tmp_path / "none").stderr
 
 
 def test_the_suffix_names_the_format(runs, tmp_path: Path) -> None:

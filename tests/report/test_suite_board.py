@@ -107,6 +107,14 @@ def test_rows_of_the_board_that_compare_stand_beside_ours(prepared: PreparedSuit
     assert "3dgs (board)" in to_text([table, pairs])
 
 
+def test_a_run_without_its_settings_has_its_row(prepared: PreparedSuite, tmp_path: Path) -> None:
+    runs = runs_of(prepared, tmp_path / "runs", "robustsplat")
+    for path in runs.rglob("config.yaml"):
+        path.unlink()
+    table = suite_board(prepared, runs)[0]
+    assert cells(table, "robustsplat")["all (4) psnr"].state == "ok"
+
+
 def test_exact_poses_are_another_dataset(prepared: PreparedSuite, tmp_path: Path) -> None:
     board, runs = tmp_path / "board", runs_of(prepared, tmp_path / "runs", "robustsplat")
     assert add(board, runs_of(prepared, tmp_path / "others", "3dgs"), dataset="Toy").exit_code == 0

@@ -357,6 +357,8 @@ def test_columns_and_scenes_can_be_chosen(tmp_path: Path) -> None:
     runs = read_runs(tmp_path)
     with pytest.raises(AwError, match="did you mean 'psnr'"):
         comparison(runs, metrics=["pnsr"])
+    with pytest.raises(AwError, match="metric 'fit'"):
+        comparison(runs, metrics=["fit"])
     with pytest.raises(AwError, match="did you mean 'three'"):
         comparison(runs, scenes=["thre"])
 

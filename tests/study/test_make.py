@@ -20,7 +20,7 @@ from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.study.make import PairQuestion, page_html, render_pairs, sample_questions
 from tests.study.studies import METHODS, write_runs
-from tests.tiny_scene import TEST, TRAIN
+from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 
 
 @pytest.fixture
@@ -234,6 +234,7 @@ def test_a_scene_given_twice_and_half_a_character_are_refused(
 ) -> None:
     scene, _ = made
     page = tmp_path / "s.html"
-    assert "given twice" in error("--scene", scene, "--scene", scene / ".", "-o", page)
+    for other in (scene / ".", write_tiny_scene(tmp_path / "elsewhere" / scene.name)):
+        assert "are both called yard" in error("--scene", scene, "--scene", other, "-o", page)
     assert "half a character" in error("--scene", scene, "-o", page, "--title", "a\udcff")
     assert not page.exists()

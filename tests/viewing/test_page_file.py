@@ -15,7 +15,13 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.trained_models import Viewer, read_render_settings, view_runs
+from ambiguous_wild.harness.trained_models import (
+    SceneModels,
+    Viewer,
+    next_steps,
+    read_render_settings,
+    view_runs,
+)
 from ambiguous_wild.io.files import own_json, sha256_file, write_json
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.mask_reasons import reasons_of, write_reasons
@@ -191,10 +197,6 @@ def test_runs_of_two_scenes_need_a_choice(runs: Path, tmp_path: Path) -> None:
     write_shown_run(tmp_path / "runs", other, "3dgs")
     with pytest.raises(AwError, match="give those of one"):
         view_runs([runs, tmp_path / "runs"], tmp_path / "out")
-    with pytest.raises(AwError, match="unknown scene 'hall'"):
-        view_runs([runs], tmp_path / "out", scene="hall")
-    page = view_runs([runs, tmp_path / "runs"], tmp_path / "out", scene="yard")
-    assert len(facts(page.path.read_text())["models"]) == 1
 
 
 def test_seeds_have_labels_of_their_own(runs: Path, tmp_path: Path) -> None:
@@ -224,6 +226,9 @@ def test_a_stranger_s_method_name_imports_no_file(runs: Path, tmp_path: Path) ->
     look, note = read_render_settings(config)
     assert not (tmp_path / "ran").exists() and look == RenderSettings() and "--plugin" in note
     assert read_render_settings({"method": "3dgs", "options": {}, "effects": ["antialias"]})[0].antialias
+    for damaged in ({"effects": 5}, {"scene": {"background": [0, 0]}}, {"scene": {"background": None}}):
+        with pytest.raises(AwError, match="damaged"):
+            read_render_settings({"method": "3dgs", "options": {}, **damaged})
     look, note = read_render_settings({"method": "3dgs", "options": {"gone": 1}, "effects": ["antialias"]})
     assert look.antialias and "'gone'" in note
 
@@ -363,10 +368,21 @@ def test_the_panel_names_files_and_the_command_that_trains_on(
         place = f"{above}{run.relative_to(tmp_path / 'out').as_posix()}"
         assert f"`{place}/masks`" in steps and f"`aw table {above}runs`" in steps
         assert str(tmp_path) not in text
-    chosen = facts(view_runs([run], tmp_path / "page", steps=[HOSTILE]).path.read_text())
-    assert chosen["next"] == [HOSTILE]
     change_result(run, lambda r: r.update(reproduce='aw "'))
     assert facts(view_runs([run], tmp_path / "page").path.read_text())["models"][0]["retrain"] == ""
+
+
+def test_a_run_may_be_named_from_within_and_lie_anywhere(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = next(path.parent for path in runs.rglob("config.yaml"))
+    for here, name in ((run.parent, run.name), (run, ".")):
+        monkeypatch.chdir(here)
+        assert facts(view_runs([Path(name)], tmp_path / "page").path.read_text())["next"]
+    model = ViewedModel("3dgs", Path("point_cloud.ply"))
+    monkeypatch.chdir("/")
+    shown = SceneModels(load_scene(runs.parent / "porch"), (model,), (), runs=(Path("/data/seed0"),))
+    assert "`aw export data/seed0`" in next_steps(shown)[0]
 
 
 def test_reasons_of_a_run_come_with_its_masks_and_damaged_ones_do_not(runs: Path, tmp_path: Path) -> None:

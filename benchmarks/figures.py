@@ -28,6 +28,7 @@ ROOT = Path(__file__).parents[1]
 RANKED = ("3dgs", "dronesplat", "robustsplat", "refinesplat")
 METHODS = (*RANKED, "3dgs+truth")
 REFERENCES = ("3dgs+truth", "3dgs-clean")
+LENGTH = 1000  # iterations of the tables
 RANKED_ON = ("aw-sim", "composites")
 SUITE = get_suite("aw-sim").tables
 PASTED = ("cutouts", "patches")
@@ -56,12 +57,14 @@ def rows(*datasets: str) -> Iterator[Mapping[str, str]]:
             yield from csv.DictReader(file)
 
 
-def board(*datasets: str, only: str = "") -> Board:
-    """The metrics of some tables of the board, of one seed or as means over all."""
+def board(*datasets: str, only: str = "", iterations: int = LENGTH) -> Board:
+    """The metrics of some tables of the board at one length, of one seed or as means over all."""
     seeds: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     for row in rows(*datasets):
+        if row["cost_iterations"] != str(iterations) or only not in ("", row["seed"]):
+            continue
         for metric in ("psnr", "mask_iou"):
-            if row[metric] and only in ("", row["seed"]):
+            if row[metric]:
                 seeds[row["scene"], label(row), metric].append(float(row[metric]))
     found: dict[str, dict[str, dict[str, float]]] = defaultdict(lambda: defaultdict(dict))
     for (scene, method, metric), values in seeds.items():

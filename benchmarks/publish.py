@@ -47,6 +47,7 @@ KINDS = ("cutouts", "patches")
 MOVERS = ROOT / "benchmarks" / "movers.json"  # capture: photo: polygons [[x, y], ...]
 DRAWN = {"train": 2, "statue": 2, "reichstag": 4}  # captures of MOVERS: downsampling
 METHODS = ("3dgs", "dronesplat", "robustsplat", "refinesplat", "3dgs+truth")
+LENGTH = 1000  # iterations
 WORLD = 5  # seed of pasted distractors; nothing was tuned on it
 # Options of methods that would take whatever pretrained networks lie on this machine; --set replaces them.
 HAND_MADE = {"robustsplat": ("features=labhog",), "refinesplat-paper": ("features=labhog", "instances=graph")}
@@ -155,13 +156,15 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--methods", nargs="+", default=METHODS)
     parser.add_argument("--set", nargs="+", default=[], metavar="METHOD.OPTION=VALUE")
     parser.add_argument("--seeds", nargs="+", type=seed, default=[0, 1, 2])
-    parser.add_argument("--iterations", type=count, default=1000)
+    parser.add_argument("--iterations", type=count, default=LENGTH)
     parser.add_argument("--jobs", type=count, default=2, help="runs at a time")
     parser.add_argument("--board", type=Path, default=ROOT / "leaderboard")
     args = parser.parse_args(words)
     if args.methods == ["all"]:
         args.methods = [*all_methods()]
-    args.runs = args.work / "-".join(["runs", *args.set])  # runs with other options have their own folder
+    # runs of another length or with other options have their own folder
+    length = [] if args.iterations == LENGTH else [str(args.iterations)]
+    args.runs = args.work / "-".join(["runs", *length, *args.set])
     real = {capture.name: capture for capture in real_captures(args.data)} if args.data else {}
     known = [*SUITE.scenes, *real]
     if unknown := set(args.only or ()) - {*known}:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.data import shrink_camera
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -107,9 +108,11 @@ class PupDensity(DensityControl):
     def blocks(self, step: Step, gaussians: Gaussians) -> Tensor:
         """Sum the mean g g^T over views, g = d(sum(signs picture))/d(mean, log s), [N, 6, 6] float64."""
         total = torch.zeros(len(gaussians), 6, 6, dtype=torch.float64, device=gaussians.device)
+        numba, draw = backend_of(total.device).kernels, torch.enable_grad()(step.draw)
         for camera in self.cameras:
-            rendered = step.draw(camera)
-            for _ in range(self.config.signs):
+            for index in range(self.config.signs):
+                if not index or not numba:  # on a GPU a picture has one backward pass
+                    rendered = draw(camera)
                 signs = self.rng.integers(0, 2, (camera.height, camera.width, 3)) * 2 - 1
                 g = rendered.backward(torch.from_numpy(signs.astype(np.float32)).to(total.device))
                 both = torch.cat([g.means, g.log_scales], dim=1).double()

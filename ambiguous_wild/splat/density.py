@@ -38,7 +38,8 @@ class DensityConfig:
     every: float = 100.0
     min_every: int = 50  # a short run densifies less often, so that each decision averages enough views
     resets: tuple[float, ...] = (3000.0, 6000.0, 9000.0, 12_000.0)
-    min_reset_spacing: int = 3000  # real iterations between resets, and before the first
+    # real iterations between resets, and before the first; at most the nominal time between them
+    min_reset_spacing: int = 3000
     min_reset_rest: int = 6000  # real iterations left after a reset: until then it costs decibels
     grow_grad: float = 2e-4  # mean norm of dL/d(u, v) over the views that saw it, times half the image size
     grow_scale: float = 0.01  # of the scene extent: clone below, split above
@@ -219,11 +220,13 @@ class DensityControl:
 
     def _reset_due(self, step: Step) -> bool:
         config = self.config
-        while self.resets_done < len(config.resets) and step.nominal >= config.resets[self.resets_done]:
-            grows = config.resets[self.resets_done] <= config.stop  # as in 3DGS: no reset after growth ends
+        for before, reset in list(zip((0.0, *config.resets), config.resets))[self.resets_done :]:
+            if step.nominal < reset:
+                break
+            grows = reset <= config.stop  # as in 3DGS: no reset after growth ends
             self.resets_done += 1
             rest = step.iteration * (NOMINAL_ITERATIONS / step.nominal - 1.0)
-            apart = step.iteration - self.last_reset >= config.min_reset_spacing
+            apart = step.iteration - self.last_reset >= min(config.min_reset_spacing, reset - before)
             if grows and apart and rest >= config.min_reset_rest:
                 return True
         return False

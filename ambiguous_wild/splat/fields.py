@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -48,6 +49,8 @@ class FieldStart:
 
 class Fields(ABC):
     """A method whose pictures are made of several fields."""
+
+    layers: ClassVar[bool] = False  # True: fields lie `over` the static one, drawn without a background
 
     @abstractmethod
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:

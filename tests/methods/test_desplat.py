@@ -104,6 +104,15 @@ def test_test_views_show_the_static_field_alone_and_the_mask_is_what_the_layer_l
         assert not torch.equal(alone, step.rendered.image)
 
 
+def test_a_clear_layer_lets_a_white_background_through(scene, tmp_path):
+    trainer = trainer_of(scene, tmp_path, parts_of("desplat", points="200", min_start="0"), behind=255)
+    for layer in trainer.drawing.others.values():
+        layer.gaussians.opacity_logits.fill_(-20.0)
+    shown = trainer.make_step(1, 0).rendered
+    alone = frames_of(shown)[STATIC]
+    assert alone.alpha.min() < 0.5 and torch.equal(shown.image, alone.image)
+
+
 def test_layers_take_up_distractors(scene, tmp_path):
     """The red squares of the photos are covered more than the rest of them."""
     trainer = trained(scene, tmp_path, parts_of("desplat", points="200", min_start="0"), iterations=400)

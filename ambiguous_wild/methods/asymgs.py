@@ -7,10 +7,11 @@ GS-GS form (`asymgs-twin`): two models; the first sees a photo under the hard ma
 under the learnt one; in both views their pictures must agree. The first is the result. A step draws four
 pictures with gradients.
 
-Source: arXiv 2506.03538 and its released code. Ours: features (Lab and HOG for DINOv2's patch embedding) and
-instances (graph segments for Semantic-SAM's) without weights, both options; masks weigh SSIM's map, not its
-gradient; the base is 3DGS without Mip-Splatting's filters and growth; the camera of the twin's photo stays as
-COLMAP gave it even if an effect moves cameras.
+Source: arXiv 2506.03538 and its released code. Ours: features (Lab and HOG; the published patch embedding of
+DINOv2 is no option) and instances (graph segments for Semantic-SAM's) without weights, both options; masks
+weigh SSIM's map, not its gradient; the base is 3DGS without Mip-Splatting's filters and growth; the camera of
+the twin's photo stays as COLMAP gave it even if an effect moves cameras. Left out: the appearance model for
+photo collections (codes of photos and Gaussians, and a net of colours).
 """
 
 from __future__ import annotations

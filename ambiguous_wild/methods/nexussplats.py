@@ -137,7 +137,11 @@ class Codes(Learnt):
             kept = hashed_uniform(x.numel(), key, x.device).reshape(x.shape) >= share
             return torch.relu(x) * kept / (1.0 - share)
 
-        return visible.base + 2.0 * torch.sigmoid(mlp(inputs, leaf, "toned", dropout if share else torch.relu)) - 1.0
+        return (
+            visible.base
+            + 2.0 * torch.sigmoid(mlp(inputs, leaf, "toned", dropout if share else torch.relu))
+            - 1.0
+        )
 
     def uncertainty(self, codes: Tensor, leaf: Mapping[str, Tensor]) -> Tensor:
         """Return the raw uncertainty [M] of Gaussians with these codes [M, 32] in the photo of the leaves."""

@@ -67,6 +67,11 @@ class Growth:
     clones: Tensor  # [a] int64, rows that are copied
     splits: Tensor  # [b] int64, rows that two smaller samples replace
 
+    @classmethod
+    def of(cls, chosen: Tensor, small: Tensor) -> Growth:
+        """Clone those of the chosen rows [N] bool that are small [N] bool, and split the others."""
+        return cls(*(torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small)))
+
 
 class DensityControl:
     """Accumulates the screen-space statistic and changes the set of Gaussians on schedule.
@@ -78,8 +83,7 @@ class DensityControl:
     # statistics of the backward pass beyond the signed sums, of `rendered.NEEDS`
     needs: ClassVar[frozenset[str]] = frozenset()
     reads_keep: ClassVar[bool] = False  # whether `observe` reads the keep map
-    # True as in WildGaussians: rows change before the optimiser's step, which is then left out
-    before_optimiser: ClassVar[bool] = False
+    needs_effect: ClassVar[str] = ""  # name of the effect without which a run is refused
     # sums for each Gaussian since the last round: attribute name, and the shape after [N]
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": ()}
 
@@ -235,8 +239,7 @@ class DensityControl:
         """Choose the rows that grow in this round, at most `room` of them."""
         score = self.mean_gradient()
         chosen = largest(score, score > self.config.grow_grad, self.room(step, gaussians))
-        small = self.small(gaussians)
-        return Growth(*(torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small)))
+        return Growth.of(chosen, self.small(gaussians))
 
     def mean_gradient(self) -> Tensor:
         """Return the mean norm of each row's statistic over the views that saw it, [N]; 0 where none did."""

@@ -14,7 +14,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core.config import Facts
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.field import Rates
@@ -84,10 +83,6 @@ class Fields(ABC):
 
     def gradients(self, step: Step, keep: Tensor | None) -> Mapping[str, Gradients]:
         """Return gradients of further pictures (`Step.draw`) by field; they are added to the step's."""
-        return {}
-
-    def facts(self) -> Facts:
-        """Return plain values for the run's metrics."""
         return {}
 
 

@@ -80,7 +80,11 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
         code = codes[row : row + 1].clone().requires_grad_()
         (through,) = torch.autograd.grad(policy.effect.uncertainty(code, leaf).sum(), code)
     torch.testing.assert_close(found[row], (slope_of_raw * through[0]).float(), rtol=0.03, atol=1e-7)
-    assert gradients.effect_grads["nexussplats"].keys() >= {"transient", "uncertainty_weight0", "uncertainty_bias2"}
+    assert gradients.effect_grads["nexussplats"].keys() >= {
+        "transient",
+        "uncertainty_weight0",
+        "uncertainty_bias2",
+    }
     assert not gradients.sh0.any() and not gradients.screen.any()
     assert torch.equal(kept(keep), policy.predict(step))
     assert kept(torch.tensor([1.5, 0.9])).tolist() == [1.0, 0.0] and kept(torch.tensor([0.9])).item() == 1.0

@@ -78,7 +78,7 @@ class AbsDensity(AbsoluteSums):
         signed = self.grad_sum / seen / max(self.config.grow_grad, 1e-12)
         score = torch.where(small, signed, self.abs_sum / seen / self.config.split_grad)
         chosen = largest(score, score >= 1.0, self.room(step, gaussians))
-        return Growth(*(torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small)))
+        return Growth.of(chosen, small)
 
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:

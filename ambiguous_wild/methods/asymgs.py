@@ -7,10 +7,11 @@ GS-GS form (`asymgs-twin`): two models; the first sees a photo under the hard ma
 under the learnt one; in both views their pictures must agree. The first is the result. A step draws four
 pictures with gradients.
 
-Source: arXiv 2506.03538 and its released code. Ours: features (Lab and HOG for DINOv2's patch embedding) and
-instances (graph segments for Semantic-SAM's) without weights, both options; masks weigh SSIM's map, not its
-gradient; the base is 3DGS without Mip-Splatting's filters and growth; the camera of the twin's photo stays as
-COLMAP gave it even if an effect moves cameras.
+Source: arXiv 2506.03538 and its released code. Ours: features (Lab and HOG; the published patch embedding of
+DINOv2 is no option) and instances (graph segments for Semantic-SAM's) without weights, both options; masks
+weigh SSIM's map, not its gradient; the base is 3DGS without Mip-Splatting's filters and growth; the camera of
+the twin's photo stays as COLMAP gave it even if an effect moves cameras. Left out: the appearance model for
+photo collections (codes of photos and Gaussians, and a net of colours).
 """
 
 from __future__ import annotations
@@ -206,7 +207,7 @@ class SecondModel(Fields):
 
     def __init__(self, config: TwinConfig, masks: AsymMask) -> None:
         self.config, self.masks = config, masks
-        self._second: tuple[int, Camera] | None = None  # photo and camera of the second model in this step
+        self._second: Camera | None = None  # camera of the second model in this step
 
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:
         self.data = data
@@ -223,25 +224,26 @@ class SecondModel(Fields):
         weight = self.config.consistency if context.nominal > self.config.warm_up else 0.0
         cotangent = apart.sign() * (weight / apart.numel())
         second = -cotangent
-        if self._second is not None and context.camera is self._second[1]:
-            second = second + self._photometric(self._second[0], frames[TWIN].image, context.downsampling)
+        if context.camera is self._second:
+            second = second + self._photometric(context, frames[TWIN].image)
         return {STATIC: Cotangents(image=cotangent), TWIN: Cotangents(image=second)}
 
     def gradients(self, step: Step, keep: Tensor | None) -> Mapping[str, Gradients]:
         """Return gradients of both models in the second view, which is drawn with replacement."""
         view = int(np.random.default_rng((self.data.seed, step.iteration)).integers(len(self.data.cameras)))
-        camera = shrink_camera(self.data.cameras[view], step.downsampling)
-        self._second = view, camera
-        rendered = step.draw(camera=camera)
+        self._second = shrink_camera(self.data.cameras[view], step.downsampling)
+        photo = shrink(self.data.photos[view], step.downsampling)
+        rendered = replace(step, view=view, camera=self._second, photo=photo).draw()
         gradients = rendered.backward(Cotangents(image=torch.zeros_like(rendered.image)))
         self._second = None
-        return {STATIC: gradients}  # those of the second model are in `fields`
+        # effects learn the rows of the step's photo alone; gradients of the second model are in `fields`
+        return {STATIC: replace(gradients, effect_grads={})}
 
-    def _photometric(self, view: int, image: Tensor, factor: int) -> Tensor:
+    def _photometric(self, context: ViewContext, image: Tensor) -> Tensor:
         """Return dL/dimage of the second model under the learnt mask of its photo; the mask learns too."""
-        keep, user = self.masks.soft_keep(view, image.shape[:2]), self.data.user_keep[view]
+        assert context.view is not None and context.photo is not None
+        keep, user = self.masks.soft_keep(context.view, image.shape[:2]), self.data.user_keep[context.view]
         if user is not None:
-            keep = keep * shrink_keep(user, factor)
-        self.masks.learn_soft(view, image)
-        photo = shrink(self.data.photos[view], factor)
-        return photometric(image, photo, keep).d_image
+            keep = keep * shrink_keep(user, context.downsampling)
+        self.masks.learn_soft(context.view, image)
+        return photometric(image, context.photo, keep).d_image

@@ -113,6 +113,7 @@ BUILTIN = (
         recipe="ambiguous_wild.methods.asymgs:build_twin",
         paper="AsymGS, NeurIPS 2025 (arXiv 2506.03538), its GS-GS form",
         cite="li2026robust",
+        note="features {features}, instances {instances}",
     ),
     MethodEntry(
         name="spotlesssplats",

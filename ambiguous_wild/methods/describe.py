@@ -92,7 +92,7 @@ BUILTIN_TRAITS = {
         published="DINOv2 ViT-S/14 with FeatUp; SAM 2 in its second stage",
     ),
     "forestsplats": Traits(
-        "net on the photo, superpixels", "", "", "transient field, bending and mask nets",
+        "net on the photo, superpixels", "", "", "transient field, deformation and mask nets",
         source="code, in part",
     ),
     "asymgs": Traits(

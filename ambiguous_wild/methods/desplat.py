@@ -75,6 +75,8 @@ class LayerMask(MaskPolicy):
 class Layers(Fields):
     """One field for each train photo."""
 
+    layers = True
+
     def __init__(self, config: DeSplatConfig) -> None:
         self.config = config
 

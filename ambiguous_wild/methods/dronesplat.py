@@ -57,9 +57,9 @@ def build(options: DroneSplatConfig) -> MethodHooks:
 def combined_residual(
     render: Tensor,  # [H, W, 3]
     photo: Tensor,  # [H, W, 3] in [0, 1]
-    weight_l1: float = 4.0,
+    weight_l1: float,
 ) -> Tensor:
-    """Return E = (4 a + s) / 5 [H, W] of mean |render - photo| and 1 - SSIM, each scaled to [0, 1]."""
+    """Return E = (w a + s) / (w + 1) [H, W] of mean |render - photo| and 1 - SSIM, each scaled to [0, 1]."""
     a = (render - photo).abs().mean(dim=2)
     s = (1.0 - ssim_map(render, photo)).mean(dim=2)
     return (weight_l1 * unit_range(a) + unit_range(s)) / (weight_l1 + 1.0)
@@ -91,7 +91,7 @@ def label_means(values: Tensor, labels: Tensor, count: int) -> Tensor:
     return backend.label_sums(flat, count, weights) / backend.label_sums(flat, count).clamp(min=1)
 
 
-def threshold(heat: Tensor, nominal: float, t_local: float = 0.4) -> Tensor:
+def threshold(heat: Tensor, nominal: float, t_local: float) -> Tensor:
     """Return T(it) = mu + sd + t_local sd (N - it) / N over the photo's pixels, a 0-d tensor."""
     left = max(NOMINAL_ITERATIONS - nominal, 0.0) / NOMINAL_ITERATIONS
     return heat.mean() + heat.std(correction=0) * (1.0 + t_local * left)

@@ -18,7 +18,7 @@ from torch import Tensor
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.absgs import AbsoluteSums
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
-from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
+from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes, widened
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
@@ -47,12 +47,13 @@ def build(options: MipConfig) -> MethodHooks:
 
 def opacity_factor(log_scales: Tensor, size: Tensor) -> Tensor:
     """Return the factor [N] of opacities under a filter of size f [N]: sqrt(prod s^2 / prod (s^2 + f^2))."""
-    variance = (2 * log_scales).exp()
-    return (variance / (variance + size[:, None] ** 2)).prod(dim=1).sqrt()
+    return widened(log_scales, size)[1].prod(dim=1).sqrt()
 
 
 class MipDensity(DensityControl):
     """Density control of 3DGS whose reset brings the filtered opacity to the target."""
+
+    needs_effect = SmoothingFilter.name
 
     def setup(self, data: TrainData) -> None:
         self.cameras = data.cameras
@@ -76,7 +77,7 @@ class AbsoluteMipDensity(AbsoluteSums, MipDensity):
         limit = matched(absolute, share)
         score = torch.maximum(signed / max(self.config.grow_grad, 1e-12), absolute / max(limit, 1e-12))
         chosen = largest(score, growing | (absolute >= limit), self.room(step, gaussians))
-        return Growth(*(torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small)))
+        return Growth.of(chosen, small)
 
 
 def matched(absolute: Tensor, share: float) -> float:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -69,7 +70,7 @@ class NexusSplatsConfig:
     light_width: int = 64  # published 256, for ten Gaussians at once
     doubt_width: int = 64  # published 128, likewise
     dropout: float = 0.2
-    # codes of photos and doubts; runs below 30 000 iterations have higher rates of photos and nets
+    # codes of photos and uncertainty; runs below 30 000 iterations have higher rates of photos and nets
     lr_code: float = 1e-3
     lr_light: float = 5e-3  # rate of a Gaussian's light
     lr_net: float = 5e-4
@@ -86,7 +87,7 @@ def build(options: NexusSplatsConfig) -> MethodHooks:
     """Return 3DGS without resets, with colours and uncertainty from codes."""
     codes = Codes(options)
     control = type("NexusDensity", (SmallVolumes,), {"weight": options.volume})
-    return MethodHooks(Doubt(codes), control, options.density, effects=(codes,))
+    return MethodHooks(DrawnUncertainty(codes), control, options.density, effects=(codes,))
 
 
 class Codes(Learnt):
@@ -109,39 +110,46 @@ class Codes(Learnt):
             start = torch.tensor(0.01 * rng.normal(size=(len(data.photos), CODE)), dtype=torch.float32)
             return Leaf(start, self.config.lr_code, per_photo=True, made_for=NOMINAL_ITERATIONS)
 
-        light, doubt, rate = self.config.light_width, self.config.doubt_width, self.config.lr_net
+        light, hidden, rate = self.config.light_width, self.config.doubt_width, self.config.lr_net
         photos = {"light": codes(), "transient": codes()}
         nets = {
             **mlp_leaves("toned", (3 + 24 + CODE + 3, light, light, 3), rng, rate),
-            **mlp_leaves("doubt", (2 * CODE, doubt, doubt, 1), rng, rate),
+            **mlp_leaves("uncertainty", (2 * CODE, hidden, hidden, 1), rng, rate),
         }
         return photos | {name: replace(leaf, made_for=NOMINAL_ITERATIONS) for name, leaf in nets.items()}
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
         light = noisy_fourier(gaussians.means, self.points, [self.seed, 0x4E])
-        doubt = torch.zeros(len(gaussians), CODE, device=gaussians.device)
+        uncertainty = torch.zeros(len(gaussians), CODE, device=gaussians.device)
         return {
             "nexus_light": GaussianAttribute(light, self.config.lr_light),
-            "nexus_doubt": GaussianAttribute(doubt, self.config.lr_code),
+            "nexus_uncertainty": GaussianAttribute(uncertainty, self.config.lr_code),
         }
 
     def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo = leaf["light"].expand(len(visible.base), CODE)
         towards = directions(visible.means.detach(), context.camera)
         inputs = torch.cat([visible.base, visible.attributes["nexus_light"], photo, towards], dim=1)
-        if context.view is not None and self.config.dropout:
-            kept = hashed_uniform(inputs.numel(), (self.seed, context.iteration), inputs.device)
-            kept = (kept >= self.config.dropout).reshape(inputs.shape) / (1.0 - self.config.dropout)
-            inputs = inputs * kept
-        return visible.base + 2.0 * torch.sigmoid(mlp(inputs, leaf, "toned")) - 1.0
+        share, layer = self.config.dropout if context.view is not None else 0.0, count()
 
-    def doubts(self, codes: Tensor, leaf: Mapping[str, Tensor]) -> Tensor:
+        def dropout(x: Tensor) -> Tensor:
+            key = (self.seed, context.iteration, next(layer))
+            kept = hashed_uniform(x.numel(), key, x.device).reshape(x.shape) >= share
+            return torch.relu(x) * kept / (1.0 - share)
+
+        return (
+            visible.base
+            + 2.0 * torch.sigmoid(mlp(inputs, leaf, "toned", dropout if share else torch.relu))
+            - 1.0
+        )
+
+    def uncertainty(self, codes: Tensor, leaf: Mapping[str, Tensor]) -> Tensor:
         """Return the raw uncertainty [M] of Gaussians with these codes [M, 32] in the photo of the leaves."""
         photo = leaf["transient"].expand(len(codes), CODE)
-        return mlp(torch.cat([codes, photo], dim=1), leaf, "doubt")[:, 0]
+        return mlp(torch.cat([codes, photo], dim=1), leaf, "uncertainty")[:, 0]
 
 
-class Doubt(EffectMask, CountingMask, WarmUpMask):
+class DrawnUncertainty(EffectMask, CountingMask, WarmUpMask):
     """Keeps pixels where the drawn uncertainty gives a weight above 1."""
 
     config: NexusSplatsConfig
@@ -156,6 +164,7 @@ class Doubt(EffectMask, CountingMask, WarmUpMask):
 
     def setup(self, data: TrainData) -> None:
         super().setup(data)
+        self.behind = data.scene.background[0]  # its red
         self.distance.setup(data)
 
     def keep(self, step: Step) -> Tensor | None:
@@ -178,11 +187,12 @@ class Doubt(EffectMask, CountingMask, WarmUpMask):
         g, seen = step.gaussians, self._seen(step)
         with torch.set_grad_enabled(learn):
             leaf = {name: value.requires_grad_(learn) for name, value in self.effect._leaf(step).items()}
-            codes = g.attributes["nexus_doubt"][seen].detach().requires_grad_(learn)
-            doubts = self.effect.doubts(codes, leaf)
-        drawn = step.draw(gaussians=as_colour(g, seen, doubts.detach()), without=COLOURING)
+            codes = g.attributes["nexus_uncertainty"][seen].detach().requires_grad_(learn)
+            uncertainty = self.effect.uncertainty(codes, leaf)
+        drawn = step.draw(gaussians=as_colour(g, seen, uncertainty.detach()), without=COLOURING)
         with torch.set_grad_enabled(learn):
-            raw = (drawn.image[..., 0] - SHIFT * drawn.alpha).detach().requires_grad_(learn)
+            shift = SHIFT - self.behind
+            raw = (drawn.image[..., 0] - shift * drawn.alpha - self.behind).detach().requires_grad_(learn)
             # with an upper limit of w instead, the distance has no gradient where w reaches it, and sigma
             # falls without end
             sigma = MIN_SIGMA + F.softplus(raw)
@@ -196,11 +206,11 @@ class Doubt(EffectMask, CountingMask, WarmUpMask):
             loss = (self.distance(step) * weight).mean() + self.config.prior * sigma.log().mean()
             (d_raw,) = torch.autograd.grad(loss, raw)
         image = torch.stack([d_raw, torch.zeros_like(d_raw), torch.zeros_like(d_raw)], dim=2)
-        back = drawn.backward(Cotangents(image=image, alpha=-SHIFT * d_raw))
+        back = drawn.backward(Cotangents(image=image, alpha=-shift * d_raw))
         inputs = [codes, *leaf.values()]
         with torch.enable_grad():
-            d_inputs = torch.autograd.grad(doubts, inputs, back.sh0[seen, 0] / SH_C0, allow_unused=True)
-        d_codes = torch.zeros_like(g.attributes["nexus_doubt"])
+            d_inputs = torch.autograd.grad(uncertainty, inputs, back.sh0[seen, 0] / SH_C0, allow_unused=True)
+        d_codes = torch.zeros_like(g.attributes["nexus_uncertainty"])
         d_codes[seen] = d_inputs[0]
         own = {name: d for name, d in zip(leaf, d_inputs[1:]) if d is not None}
         if not self.config.through_geometry:
@@ -208,13 +218,13 @@ class Doubt(EffectMask, CountingMask, WarmUpMask):
             back = replace(back, means=zeros[0], quats=zeros[1], log_scales=zeros[2], opacity_logits=zeros[3])
         gradients = replace(
             back, sh0=torch.zeros_like(g.sh0), sh_rest=torch.zeros_like(g.sh_rest), screen_abs=None,
-            screen=torch.zeros_like(back.screen), attributes={"nexus_doubt": d_codes},
+            screen=torch.zeros_like(back.screen), attributes={"nexus_uncertainty": d_codes},
             effect_grads={self.effect.name: own},
         )  # fmt: skip
         return judged, gradients
 
     def _seen(self, step: Step) -> Any:
-        """Return the rows that may be in the picture, see `Backend.rows`."""
+        """Return the rows that may be in the picture, see `Backend.visible_rows`."""
         g = step.gaussians
         return backend_of(g.device).visible_rows(lambda: in_picture(g.means, step.camera, margin=0.5))
 

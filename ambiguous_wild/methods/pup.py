@@ -1,6 +1,6 @@
 """PUP 3D-GS: removes Gaussians that can move or change size without changing a picture, then refines. Source:
 PUP 3D-GS (CVPR 2025) and its code: the score is log det of the 6x6 Gauss-Newton block of mean and log
-scale over all train views. Ours: the block is estimated from random signs (Hutchinson; rank correlation
+scale over all train views. Ours: the block is estimated from Rademacher probes (Hutchinson; rank correlation
 not measured), growth ends after a third of the run, 80 % are removed in equal rounds (released: 80 %, then
 50 %), and rates do not fall by a further 5 % every 400 iterations of refining.
 """
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
+from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.data import shrink_camera
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -33,7 +34,7 @@ class PupConfig(DensityConfig):
     rounds: int = 4
     between: float = 3000.0  # time between rounds
     share: float = 0.8  # share of the Gaussians that all rounds together remove
-    signs: int = 8  # pictures of random signs for each view, at 1/`divisor` of the photos' size
+    signs: int = 8  # Rademacher probes (random signs) for each view, at 1/`divisor` of the photos' size
     divisor: int = 4
 
     def __post_init__(self) -> None:
@@ -105,13 +106,15 @@ class PupDensity(DensityControl):
         )
 
     def blocks(self, step: Step, gaussians: Gaussians) -> Tensor:
-        """Sum the mean g g^T over views, g = d(sum(signs picture))/d(mean, log s), [N, 6, 6] float64."""
+        """Sum the mean g g^T over views, g = d(sum(probe picture))/d(mean, log s), [N, 6, 6] float64."""
         total = torch.zeros(len(gaussians), 6, 6, dtype=torch.float64, device=gaussians.device)
+        numba, draw = backend_of(total.device).kernels, torch.enable_grad()(step.draw)
         for camera in self.cameras:
-            rendered = step.draw(camera)
-            for _ in range(self.config.signs):
-                signs = self.rng.integers(0, 2, (camera.height, camera.width, 3)) * 2 - 1
-                g = rendered.backward(torch.from_numpy(signs.astype(np.float32)).to(total.device))
+            for index in range(self.config.signs):
+                if not index or not numba:  # on a GPU a picture has one backward pass
+                    rendered = draw(camera)
+                probe = self.rng.integers(0, 2, (camera.height, camera.width, 3)) * 2 - 1
+                g = rendered.backward(torch.from_numpy(probe.astype(np.float32)).to(total.device))
                 both = torch.cat([g.means, g.log_scales], dim=1).double()
                 total += both[:, :, None] * both[:, None, :] / self.config.signs
         return total

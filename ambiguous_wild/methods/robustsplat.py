@@ -5,14 +5,16 @@ Source: "RobustSplat: Decoupling Densification and Dynamics for Transient-Free 3
 are stable; a per-pixel net on frozen features learns from the agreement of photos and renders, first at a low
 scale.
 
-The published form is `features=dinov2-small-registers@504,normalise=raw`, the default where its weights are;
-else EfficientNet-Lite0, else hand-made features (Lab and HOG). Settings that depend on the features are
-"auto". Values without a comment are the authors'.
+The published form is `features=dinov2-small-registers@504,normalise=raw`, the default where its weights are,
+but for the net's input: published a square, here the photo's aspect; else EfficientNet-Lite0, else hand-made
+features (Lab and HOG). Settings that depend on the features are "auto". Values without a comment are the
+authors'.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -200,9 +202,11 @@ class RobustSplatMask(CountingMask, PausingMask):
         self.data = data
         self.histogram = self.histogram.to(data.device)
         self.distances = [counts.to(data.device) for counts in self.distances]
-        _fit(self.fine, list(data.photos), data)
+        _fit(self.fine, data.photos, data)
         self.phi = photo_features(self.fine, data.photos, data.cache_dir)
-        small = [self._coarse_picture(photo) for photo in data.photos]
+        small = data.photos  # not read here: they may not fit into memory
+        if self.config.coarse_size is None:
+            small = [self._coarse_picture(photo) for photo in data.photos]
         _fit(self.coarse, small, data)
         self.phi_coarse = photo_features(self.coarse, small, data.cache_dir)
         self.inputs = [self._inputs(phi) for phi in self.phi]
@@ -383,7 +387,7 @@ class RobustSplatMask(CountingMask, PausingMask):
         self.loss_sum, self.loss_count = state["losses"]
 
 
-def _fit(features: Features, photos: list[Tensor], data: TrainData) -> None:
+def _fit(features: Features, photos: Sequence[Tensor], data: TrainData) -> None:
     """Fit features to photos, which may be smaller than the scene's; tracks are in px of the scene's."""
     from ambiguous_wild.methods.refinesplat.inputs import train_tracks  # wants SciPy
     from ambiguous_wild.vision.sceneconv import SceneConv
@@ -393,7 +397,7 @@ def _fit(features: Features, photos: list[Tensor], data: TrainData) -> None:
         return
 
     point, photo, xy = train_tracks(data.scene)
-    scale = photos[0].shape[1] / data.photos[0].shape[1]
+    scale = photos[0].shape[1] / data.cameras[0].width
     features.fit_scene(photos, (point, photo, xy * scale), data.cache_dir)
 
 

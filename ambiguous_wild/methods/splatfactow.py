@@ -81,6 +81,10 @@ class SplatfactoColours(Learnt):
     def __init__(self, config: SplatfactoWConfig) -> None:
         self.config = config
 
+    def setup(self, data: TrainData) -> None:
+        super().setup(data)
+        self.behind = torch.tensor(data.scene.background, device=data.device)
+
     def acts(self, hook: str) -> bool:
         return (hook != "image" or self.config.background) and super().acts(hook)
 
@@ -129,7 +133,8 @@ class SplatfactoColours(Learnt):
         return enlarged(colours.reshape(*small, 3), height, width)
 
     def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
-        return (image + (1.0 - alpha)[..., None] * self.background(leaf, context)).clamp(0.0, 1.0)
+        background = self.background(leaf, context) - self.behind  # instead of the scene's
+        return (image + (1.0 - alpha)[..., None] * background).clamp(0.0, 1.0)
 
 
 def _up_to(basis: Tensor, degree: float) -> Tensor:

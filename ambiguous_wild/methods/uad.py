@@ -9,7 +9,6 @@ the keep map masks. Without masks u is 0 everywhere.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -36,7 +35,6 @@ class UncertaintyAware(DensityControl):
 
     needs: ClassVar[frozenset[str]] = frozenset({"count"})
     reads_keep: ClassVar[bool] = True
-    sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": ()}
 
     @torch.no_grad()
     def observe(self, step: Step, gradients: Gradients, keep: Tensor | None = None) -> None:

@@ -75,8 +75,8 @@ def psnr(
 ) -> float:
     """Peak signal-to-noise ratio in dB over all pixels and channels, -10 log10(MSE).
 
-    Identical images give ``inf``, which is neither capped nor dropped in means, tables and files, so that a
-    copied test photo is noticed.
+    Identical images give ``inf``, which is not capped in files, but left out of means: a few equal pixels
+    would decide each.
 
     Raises:
         AwError: see `checked_pair`.

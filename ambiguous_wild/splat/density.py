@@ -38,7 +38,8 @@ class DensityConfig:
     every: float = 100.0
     min_every: int = 50  # a short run densifies less often, so that each decision averages enough views
     resets: tuple[float, ...] = (3000.0, 6000.0, 9000.0, 12_000.0)
-    min_reset_spacing: int = 3000  # real iterations between resets, and before the first
+    # real iterations between resets, and before the first; at most the nominal time between them
+    min_reset_spacing: int = 3000
     min_reset_rest: int = 6000  # real iterations left after a reset: until then it costs decibels
     grow_grad: float = 2e-4  # mean norm of dL/d(u, v) over the views that saw it, times half the image size
     grow_scale: float = 0.01  # of the scene extent: clone below, split above
@@ -66,6 +67,11 @@ class Growth:
     clones: Tensor  # [a] int64, rows that are copied
     splits: Tensor  # [b] int64, rows that two smaller samples replace
 
+    @classmethod
+    def of(cls, chosen: Tensor, small: Tensor) -> Growth:
+        """Clone those of the chosen rows [N] bool that are small [N] bool, and split the others."""
+        return cls(*(torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small)))
+
 
 class DensityControl:
     """Accumulates the screen-space statistic and changes the set of Gaussians on schedule.
@@ -77,8 +83,7 @@ class DensityControl:
     # statistics of the backward pass beyond the signed sums, of `rendered.NEEDS`
     needs: ClassVar[frozenset[str]] = frozenset()
     reads_keep: ClassVar[bool] = False  # whether `observe` reads the keep map
-    # True as in WildGaussians: rows change before the optimiser's step, which is then left out
-    before_optimiser: ClassVar[bool] = False
+    needs_effect: ClassVar[str] = ""  # name of the effect without which a run is refused
     # sums for each Gaussian since the last round: attribute name, and the shape after [N]
     sums: ClassVar[Mapping[str, tuple[int, ...]]] = {"grad_sum": (), "views_seen": ()}
 
@@ -219,11 +224,13 @@ class DensityControl:
 
     def _reset_due(self, step: Step) -> bool:
         config = self.config
-        while self.resets_done < len(config.resets) and step.nominal >= config.resets[self.resets_done]:
-            grows = config.resets[self.resets_done] <= config.stop  # as in 3DGS: no reset after growth ends
+        for before, reset in list(zip((0.0, *config.resets), config.resets))[self.resets_done :]:
+            if step.nominal < reset:
+                break
+            grows = reset <= config.stop  # as in 3DGS: no reset after growth ends
             self.resets_done += 1
             rest = step.iteration * (NOMINAL_ITERATIONS / step.nominal - 1.0)
-            apart = step.iteration - self.last_reset >= config.min_reset_spacing
+            apart = step.iteration - self.last_reset >= min(config.min_reset_spacing, reset - before)
             if grows and apart and rest >= config.min_reset_rest:
                 return True
         return False
@@ -232,8 +239,7 @@ class DensityControl:
         """Choose the rows that grow in this round, at most `room` of them."""
         score = self.mean_gradient()
         chosen = largest(score, score > self.config.grow_grad, self.room(step, gaussians))
-        small = self.small(gaussians)
-        return Growth(*(torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small)))
+        return Growth.of(chosen, self.small(gaussians))
 
     def mean_gradient(self) -> Tensor:
         """Return the mean norm of each row's statistic over the views that saw it, [N]; 0 where none did."""

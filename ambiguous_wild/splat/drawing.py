@@ -73,7 +73,9 @@ class SceneRenderer:
         """Draw a picture in the colours of its photo, see `EffectPipeline.fit_view`."""
         return self.effects.fit_view(gaussians, context, photo, keep, self._draw)
 
-    def _draw(self, gaussians: Gaussians, context: ViewContext, shade: Shade | None) -> Rendered:
+    def _draw(
+        self, gaussians: Gaussians, context: ViewContext, shade: Shade | None, *, layer: bool = False
+    ) -> Rendered:
         hooks = self.hooks
         return render(
             gaussians,
@@ -81,7 +83,7 @@ class SceneRenderer:
             sh_degree=min(
                 int(context.nominal // hooks.schedule.sh_every), hooks.sh_degree, gaussians.sh_degree
             ),
-            background=hooks.background,
+            background=(0.0, 0.0, 0.0) if layer else hooks.background,
             antialias=hooks.antialias,
             blur=hooks.blur,
             shade=shade,
@@ -95,8 +97,10 @@ class SceneRenderer:
         names = fields.drawn(context)
         deformed = {name: fields.deform(name, self.others[name].gaussians, context) for name in names}
         drawn = {
-            name: self._draw(gaussians.share_pending_updates(self.others[name].gaussians), context, None)
-            for name, (gaussians, _) in deformed.items()
+            name: self._draw(
+                own.share_pending_updates(self.others[name].gaussians), context, None, layer=fields.layers
+            )
+            for name, (own, _) in deformed.items()
         }
         vjps = {name: vjp for name, (_, vjp) in deformed.items()}
         needs = {name: control.needs for name in drawn if (control := self.others[name].density) is not None}

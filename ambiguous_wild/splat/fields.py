@@ -9,11 +9,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from ambiguous_wild.core.config import Facts
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.field import Rates
@@ -49,6 +49,8 @@ class FieldStart:
 class Fields(ABC):
     """A method whose pictures are made of several fields."""
 
+    layers: ClassVar[bool] = False  # True: fields lie `over` the static one, drawn without a background
+
     @abstractmethod
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:
         """Return the other fields by name; called before the first step, and again when a run resumes.
@@ -81,10 +83,6 @@ class Fields(ABC):
 
     def gradients(self, step: Step, keep: Tensor | None) -> Mapping[str, Gradients]:
         """Return gradients of further pictures (`Step.draw`) by field; they are added to the step's."""
-        return {}
-
-    def facts(self) -> Facts:
-        """Return plain values for the run's metrics."""
         return {}
 
 

@@ -11,8 +11,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.splat.backend import backend_of
 
-Weighting = Literal["map", "images", "none"]
-_WEIGHTINGS = ("map", "images", "none")
+Weighting = Literal["map", "images"]
+_WEIGHTINGS = ("map", "images")
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def photometric(
         keep: keep map; None = 1 everywhere.
         lambda_dssim: share of 1 - SSIM in the loss.
         weighting: ``"map"`` weighs the SSIM map (RefineSplat, RobustSplat); ``"images"`` multiplies both
-            pictures by keep before SSIM; ``"none"`` ignores keep.
+            pictures by keep before SSIM.
 
     Raises:
         AwError: shapes differ, or the weighting is unknown.
@@ -58,8 +58,6 @@ def photometric(
         )
     if keep is not None and keep.shape != render.shape[:2]:
         raise AwError(f"keep must be {list(render.shape[:2])} as the photo, got {list(keep.shape)}")
-    if weighting == "none":
-        keep = None
     backend = backend_of(render.device)
     l1, dssim, d_image = backend.photometric(render, photo, keep, lambda_dssim, weighting)
     return PhotometricLoss((1 - lambda_dssim) * l1 + lambda_dssim * dssim, l1, dssim, d_image)

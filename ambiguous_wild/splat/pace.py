@@ -57,7 +57,8 @@ def coarse_to_fine(photos: list[np.ndarray]) -> tuple[Level, ...]:
         return FULL  # flat photos carry no frequencies to wait for
     levels = [Level(0.0, factors[0])]
     for previous, factor in itertools.pairwise(factors):
-        # Dash: begin = COARSE_UNTIL * ln(E / E_min) / ln(E_total / E_min), with E of the level that ends.
+        # COARSE_UNTIL ln(E / E_min) / ln(E_total / E_min) as in Dash, but the mean of the level that ends and
+        # of the one that begins
         share = np.log(energies[factor] / start) / np.log(total / start)
         before = np.log(energies[previous] / start) / np.log(total / start)
         levels.append(Level(float(COARSE_UNTIL * (before + share) / 2), factor))
@@ -179,7 +180,7 @@ class Pace:
         Simulated courtyard at 240x135, 3000 iterations: 14 000, 20 000, 32 000 and 64 000 Gaussians gave
         RefineSplat 30.3, 31.1, 31.3 and 30.7 dB at 9.5, 11.3, 13.6 and 19.6 ms an iteration.
         """
-        sizes = [(photo.shape[0], photo.shape[1]) for photo in data.photos]
+        sizes = [(camera.height, camera.width) for camera in data.cameras]
         return cap(self.config, self.schedule, sizes, most, self.start)
 
     def _levels(self, data: TrainData) -> tuple[Level, ...]:

@@ -91,6 +91,9 @@ class Trainer:
         views = len(data.photos)
         self.device_check = None if data.backend.reads_at_once else DeviceFiniteCheck(data.device, views)
         check_needs(hooks.density.needs, data.backend.statistics)
+        needed = hooks.density.needs_effect
+        if needed and needed not in {effect.name for effect in hooks.effects}:
+            raise AwError(f"this method's density control needs the effect {needed}: add --effects {needed}")
         most = hooks.density_config.max_gaussians
         room = Pace(config, hooks.schedule, data, start=0, most=most).most
         gaussians = hooks.first_gaussians(data, room)
@@ -427,22 +430,16 @@ class Trainer:
     ) -> list[str]:
         """Run the optimiser, density control and effects; returns the events of density control."""
         part, progress = self.clock.part, self.progress(step.iteration)
-        events: list[str] = []
         density_keep = keep
         if self.density.reads_keep and (composed := self.hooks.mask.composed_keep(step)) is not None:
             density_keep = self.combine_user_keep(step, composed)
         # as on the CPU, a fully masked photo changes nothing; only before growth does the host read the flag
         if skip_step is not None and keep is not None and self.density.due(step) and bool(skip_step):
-            return events
-        if self.density.before_optimiser:
-            with part("density"):
-                events = self.field.refine(step, gradients, density_keep)
-        if not events:  # rows that have just changed have no gradients
-            with part("optimiser"):
-                self.field.learn(gradients, progress, skip_step)
-        if not self.density.before_optimiser:
-            with part("density"):
-                events = self.field.refine(step, gradients, density_keep)
+            return []
+        with part("optimiser"):
+            self.field.learn(gradients, progress, skip_step)
+        with part("density"):
+            events = self.field.refine(step, gradients, density_keep)
         if gradients.fields:
             with part("fields"):
                 self.drawing.learn(step, gradients.fields, progress, skip_step)
@@ -478,7 +475,8 @@ class Trainer:
         """Raise NonFinite for the last step if a parameter is not finite."""
         self._read_device_check()
         view = self.pace.view(max(self.iteration, 1))
-        self.watchdog.check_parameters(self.iteration, view, self.gaussians)
+        for field in (self.field, *self.drawing.others.values()):
+            self.watchdog.check_parameters(self.iteration, view, field.gaussians)
 
 
 def _for_statistics(step: Step, gradients: Gradients, skip_step: Tensor) -> tuple[Step, Gradients]:

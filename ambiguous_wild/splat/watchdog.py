@@ -4,7 +4,8 @@ The checks are cheap: one pass over the bits of the tensors; rows are searched o
 Gradients are checked in every step, before anything changes. Those of the higher harmonics (45 of a
 Gaussian's 59 floats) are not: they are the constant's times a polynomial of a unit vector, so what breaks
 them breaks the constant too. Parameters are checked every `EVERY` iterations, after growth and before every
-checkpoint, so no checkpoint holds a value that is not finite.
+checkpoint, which checks other fields too: no checkpoint holds Gaussians that are not finite. Effects are not
+checked.
 
 On an accelerator the host does not know the result of a step until it waits for it. So the device keeps a
 flag that stays set, the number of finite steps before it, and the keep map and cotangents of the broken step

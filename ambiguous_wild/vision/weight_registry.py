@@ -46,7 +46,7 @@ class Weight:
     package: Package | None = None  # holds the weights, for kind file
     member: str = ""  # name of the file in the package
     form: Literal["flax", "torch"] = "torch"  # format of the member: a pickle of numpy arrays, or torch's
-    tensors: str = ""  # `weight_files.tensors_digest` of the published tensors
+    tensors: str = ""  # `weight_conversion.tensors_digest` of the published tensors
 
     @classmethod
     def of_hub(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -30,9 +31,11 @@ def parts_of(method: str, **options: str) -> MethodHooks:
 
 
 def trainer_of(
-    scene: Path, folder: Path, parts: MethodHooks, iterations: int = 120, seed: int = 0
+    scene: Path, folder: Path, parts: MethodHooks, iterations: int = 120, seed: int = 0, *, behind: int = 0
 ) -> Trainer:
     data = data_of(scene, folder.parent / "cache", seed)
+    info = {**data.scene.info, "background": [behind] * 3}
+    data = replace(data, scene=replace(data.scene, info=info))
     config = TrainConfig(iterations=iterations, seed=seed, probes=0, checkpoint_every_s=1e9, torch_threads=1)
     return Trainer(data, parts, config, folder=folder)
 

@@ -294,6 +294,15 @@ def test_the_background_fills_what_is_open_and_its_alpha_term_acts_there(scene, 
     assert (d_alpha[2:-2, 2:30] > 0).all()
 
 
+def test_the_background_replaces_that_of_the_scene(scene, tmp_path):
+    parts = parts_of("splatfacto-w", width="8")
+    black, white = (
+        trainer_of(scene, tmp_path, parts, behind=behind).make_step(1, 0).rendered for behind in (0, 255)
+    )
+    assert black.alpha.min() < 0.5
+    torch.testing.assert_close(black.image, white.image)
+
+
 def test_colours_start_at_degree_zero(scene, tmp_path):
     trainer = trainer_of(scene, tmp_path, parts_of("splatfacto-w", width="8"))
     effect = trainer.effects.effects[0]

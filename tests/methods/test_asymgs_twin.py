@@ -10,7 +10,7 @@ from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.fields import STATIC
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.rendered import Frame
-from tests.methods.baselines import data_of, parts_of, trained
+from tests.methods.baselines import data_of, parts_of, trained, trainer_of
 
 
 @pytest.fixture
@@ -46,11 +46,12 @@ def test_the_second_model_learns_its_own_photo_under_its_own_mask(twin):
     view, first = 2, torch.full_like(twin.data.photos[0], 0.5)
     soft = torch.sigmoid(8 * twin.masks.soft[view].values[0]).clone()
     camera = twin.data.cameras[view]
-    twin._second = view, camera
-    context = SimpleNamespace(nominal=500.0, camera=camera, downsampling=1)
+    twin._second = camera
+    photo = twin.data.photos[view]
+    context = SimpleNamespace(nominal=500.0, view=view, camera=camera, photo=photo, downsampling=1)
     found = twin.regularise(frames(first, first), context)
     keep = torch.nn.functional.interpolate(soft[None, None], size=first.shape[:2], mode="bilinear")[0, 0]
-    wanted = photometric(first, twin.data.photos[view], keep).d_image
+    wanted = photometric(first, photo, keep).d_image
     assert torch.allclose(found[TWIN].image, wanted, atol=1e-9) and wanted.abs().sum() > 0
     assert not found[STATIC].image.any()
     after = torch.sigmoid(8 * twin.masks.soft[view].values[0])
@@ -82,6 +83,12 @@ def test_both_models_learn_and_grow_and_differ(scene, tmp_path):
     second = trainer.drawing._draw(other.gaussians, trainer.context(camera), None).image
     assert 0.0 < float((first - second).abs().mean()) < 0.1
     assert torch.equal(trainer.render(camera).image, first)  # the result is the first model
+
+
+def test_the_second_view_moves_no_camera_of_the_first(scene, tmp_path):
+    trainer = trainer_of(scene, tmp_path, with_effects(make(), ("poses", "appearance")))
+    found = trainer.hooks.fields.gradients(trainer.make_step(100, 0), None)[STATIC]
+    assert found.means.any() and not found.effect_grads
 
 
 def test_both_models_grow_under_effects_and_keep_their_skybox(scene, tmp_path):

@@ -10,6 +10,7 @@ from ambiguous_wild.methods.desplat import DeSplatConfig, Layers
 from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.rendered import Cotangents, Frame
 from ambiguous_wild.splat.step import ViewContext
+from ambiguous_wild.splat.watchdog import NonFinite
 from tests.methods.baselines import data_of, parts_of, trained, trainer_of
 
 
@@ -104,6 +105,15 @@ def test_test_views_show_the_static_field_alone_and_the_mask_is_what_the_layer_l
         assert not torch.equal(alone, step.rendered.image)
 
 
+def test_a_clear_layer_lets_a_white_background_through(scene, tmp_path):
+    trainer = trainer_of(scene, tmp_path, parts_of("desplat", points="200", min_start="0"), behind=255)
+    for layer in trainer.drawing.others.values():
+        layer.gaussians.opacity_logits.fill_(-20.0)
+    shown = trainer.make_step(1, 0).rendered
+    alone = frames_of(shown)[STATIC]
+    assert alone.alpha.min() < 0.5 and torch.equal(shown.image, alone.image)
+
+
 def test_layers_take_up_distractors(scene, tmp_path):
     """The red squares of the photos are covered more than the rest of them."""
     trainer = trained(scene, tmp_path, parts_of("desplat", points="200", min_start="0"), iterations=400)
@@ -114,3 +124,12 @@ def test_layers_take_up_distractors(scene, tmp_path):
         square[14:26, 14 + 4 * view : 26 + 4 * view] = True
         inside.append(keep[square].mean()), outside.append(keep[~square].mean())
     assert np.mean(inside) < np.mean(outside) - 0.15
+
+
+def test_a_layer_that_is_not_finite_is_found_before_a_checkpoint(scene, tmp_path):
+    trainer = trainer_of(scene, tmp_path, parts_of("desplat", points="200", min_start="0"))
+    trainer.step()
+    trainer.check_parameters()
+    trainer.drawing.others["3"].gaussians.means[7] = float("nan")
+    with pytest.raises(NonFinite, match="parameter of means in 1 Gaussians"):
+        trainer.check_parameters()

@@ -36,16 +36,16 @@ def test_instances_take_the_mean_of_their_pixels():
 def test_the_threshold_by_hand():
     heat = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)  # mean 1/4, deviation sqrt(3)/4
     sd = 3**0.5 / 4
-    assert threshold(heat, 0.0) == pytest.approx(0.25 + 1.4 * sd)
-    assert threshold(heat, 15_000.0) == pytest.approx(0.25 + 1.2 * sd)
-    assert threshold(heat, 30_000.0) == pytest.approx(0.25 + sd)
-    assert threshold(heat, 40_000.0) == pytest.approx(0.25 + sd)
+    assert threshold(heat, 0.0, 0.4) == pytest.approx(0.25 + 1.4 * sd)
+    assert threshold(heat, 15_000.0, 0.4) == pytest.approx(0.25 + 1.2 * sd)
+    assert threshold(heat, 30_000.0, 0.4) == pytest.approx(0.25 + sd)
+    assert threshold(heat, 40_000.0, 0.4) == pytest.approx(0.25 + sd)
 
 
 def test_the_residual_mixes_four_to_one():
     rng = np.random.default_rng(1)
     photo, render = rng.random((2, 24, 32, 3)).astype(np.float32)
-    got = combined_residual(torch.from_numpy(render), torch.from_numpy(photo)).numpy()
+    got = combined_residual(torch.from_numpy(render), torch.from_numpy(photo), 4.0).numpy()
     a = np.abs(render - photo).mean(2)
     settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
     _, ssim = structural_similarity(photo, render, channel_axis=2, full=True, truncate=3.5, **settings)

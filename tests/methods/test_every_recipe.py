@@ -194,7 +194,7 @@ def test_what_a_mask_policy_reads_is_an_effect_of_its_method(method):
 def test_masks_are_grafted_with_the_effect_that_they_read(scene, tmp_path, method):
     parts = parts_of(f"3dgs@mask={method},effects={method}")
     trainer = trainer_of(scene, tmp_path, parts)
-    learnt = {"gs-w": "mask_weight1", "nexussplats": "doubt_weight2"}[method]
+    learnt = {"gs-w": "mask_weight1", "nexussplats": "uncertainty_weight2"}[method]
     before = parts.effects[0]._adam[learnt].values.clone()
     for _ in range(12):  # of 120: masks begin at a twelfth
         trainer.step()

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.methods import get_method
 from ambiguous_wild.methods.mip import (
     AbsoluteMipDensity,
     MipConfig,
@@ -17,6 +18,7 @@ from ambiguous_wild.methods.mip import (
 )
 from ambiguous_wild.methods.uad import UncertaintyAware, footprint_mean
 from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.rendered import GSPLAT_SUMS, check_needs
 from tests.methods.baselines import bits, data_of, parts_of, trained, trainer_of
@@ -54,6 +56,14 @@ def test_a_reset_leaves_the_filtered_opacity_at_its_target(scene, tmp_path):
     torch.testing.assert_close(torch.sigmoid(g.opacity_logits) * factor, before.clamp(max=0.01))
     assert torch.sigmoid(g.opacity_logits[0]) > 0.01  # the plain one is higher
     assert torch.sigmoid(g.opacity_logits[2]).item() == pytest.approx(0.004, rel=1e-3)
+
+
+def test_without_the_filter_the_density_control_is_refused(scene, tmp_path):
+    grafted = get_method("3dgs@density=mip-splatting")
+    parts = grafted.build(grafted.options())
+    with pytest.raises(AwError, match="needs the effect antialias: add --effects antialias"):
+        trainer_of(scene, tmp_path, parts)
+    trainer_of(scene, tmp_path, with_effects(parts, ("antialias",)))
 
 
 def test_matched_growth_takes_as_many_by_the_absolute_gradient():

@@ -1,6 +1,7 @@
 """PUP: the score against exact derivatives, who is removed, and the one round of a run."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -10,7 +11,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.pup import PupConfig, PupDensity, log_det, removed
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.training_loop import train
-from tests.methods.baselines import parts_of, trainer_of
+from tests.methods.baselines import parts_of, trained, trainer_of
+from tests.splat import fake_gsplat
 from tests.splat.scenes import camera, gaussians
 
 
@@ -105,3 +107,12 @@ def test_what_no_view_sees_goes_first(scene, tmp_path):
         trainer.gaussians.sh0[::4] = 9.0
     train(trainer)
     assert float(trainer.gaussians.sh0.max()) < 8.0
+
+
+def test_a_round_runs_on_a_gpu_and_on_colours_from_a_net(scene, tmp_path, monkeypatch):
+    options = {"rounds": "1", "divisor": "8", "signs": "2", "share": "0.5"}
+    own, other = parts_of("pup-3dgs", **options), parts_of("splatfacto-w", width="8")
+    grafted = replace(other, density=own.density, density_config=own.density_config)
+    assert trained(scene, tmp_path / "net", grafted, iterations=30).density.pruning_rounds == 1
+    with fake_gsplat.installed(monkeypatch):
+        assert trained(scene, tmp_path / "gpu", own, iterations=30).density.pruning_rounds == 1

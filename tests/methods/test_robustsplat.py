@@ -21,6 +21,7 @@ from ambiguous_wild.methods.robustsplat import (
     mask_loss,
 )
 from ambiguous_wild.vision import backends
+from ambiguous_wild.vision.labhog import LabHog
 from ambiguous_wild.vision.sceneconv import SceneConv
 from tests.methods.baselines import data_of, parts_of, step_of, trained
 from tests.tiny_scene import SQUARE, TRAIN, wall_colour
@@ -306,3 +307,10 @@ def test_the_seed_decides(scene, tmp_path):
         trained(scene, tmp_path / str(seed), parts_of("robustsplat", **EARLY), 40, seed) for seed in (0, 1)
     )
     assert not torch.equal(one.hooks.mask.net.first.weight, other.hooks.mask.net.first.weight)
+
+
+def test_features_are_fitted_without_a_list_of_all_photos(scene, tmp_path, monkeypatch):
+    data, given, fit = data_of(scene, tmp_path), [], LabHog.fit
+    monkeypatch.setattr(LabHog, "fit", lambda features, photos: (given.append(photos), fit(features, photos)))
+    parts_of("robustsplat", features="labhog").mask.setup(data)
+    assert given[0] is data.photos

@@ -12,6 +12,7 @@ from ambiguous_wild.methods.forestsplats import fill
 from ambiguous_wild.methods.hybridgs import COVERED, composed, planar_sums
 from ambiguous_wild.methods.nexussplats import GEOMETRY, SHIFT, as_colour, boundary, kept
 from ambiguous_wild.methods.t3dgs import TwoErrorHead, divergence, inverse_depth, likelihood_loss, variation
+from ambiguous_wild.splat.effects.autograd_effect import Visible
 from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.gaussians import SH_C0
 from ambiguous_wild.splat.losses import photometric
@@ -56,7 +57,7 @@ def test_uncertainty_is_blended_as_a_colour_without_a_background():
 def nexus(scene, tmp_path_factory):
     parts = parts_of("nexussplats", light_width="8", doubt_width="8", min_mask_start="1", mask_start="0")
     trainer = trainer_of(scene, tmp_path_factory.mktemp("nexus"), parts)
-    trainer.gaussians.attributes["nexus_doubt"].copy_(random(len(trainer.gaussians), 32) - 0.5)
+    trainer.gaussians.attributes["nexus_uncertainty"].copy_(random(len(trainer.gaussians), 32) - 0.5)
     return trainer
 
 
@@ -64,22 +65,26 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
     policy, step = nexus.hooks.mask, nexus.make_step(10, 0)
     keep, gradients = policy._weight(step, learn=True)
     distance = policy.distance(step)
-    codes, leaf = step.gaussians.attributes["nexus_doubt"], policy.effect._leaf(step)
+    codes, leaf = step.gaussians.attributes["nexus_uncertainty"], policy.effect._leaf(step)
 
-    def loss(doubts):
-        drawn = step.draw(gaussians=as_colour(step.gaussians, slice(None), doubts), without=("nexussplats",))
+    def loss(raw):
+        drawn = step.draw(gaussians=as_colour(step.gaussians, slice(None), raw), without=("nexussplats",))
         raw = (drawn.image[..., 0] - SHIFT * drawn.alpha).double()
         sigma = 0.1 + raw.exp().log1p()
         return (distance / (2 * sigma**2)).mean() + 0.5 * sigma.log().mean()
 
-    found = gradients.attributes["nexus_doubt"]
+    found = gradients.attributes["nexus_uncertainty"]
     row = int(found.abs().sum(dim=1).argmax())
-    slope_of_doubt = slope(loss, policy.effect.doubts(codes, leaf), row, 0.05)
+    slope_of_raw = slope(loss, policy.effect.uncertainty(codes, leaf), row, 0.05)
     with torch.enable_grad():
         code = codes[row : row + 1].clone().requires_grad_()
-        (through,) = torch.autograd.grad(policy.effect.doubts(code, leaf).sum(), code)
-    torch.testing.assert_close(found[row], (slope_of_doubt * through[0]).float(), rtol=0.03, atol=1e-7)
-    assert gradients.effect_grads["nexussplats"].keys() >= {"transient", "doubt_weight0", "doubt_bias2"}
+        (through,) = torch.autograd.grad(policy.effect.uncertainty(code, leaf).sum(), code)
+    torch.testing.assert_close(found[row], (slope_of_raw * through[0]).float(), rtol=0.03, atol=1e-7)
+    assert gradients.effect_grads["nexussplats"].keys() >= {
+        "transient",
+        "uncertainty_weight0",
+        "uncertainty_bias2",
+    }
     assert not gradients.sh0.any() and not gradients.screen.any()
     assert torch.equal(kept(keep), policy.predict(step))
     assert kept(torch.tensor([1.5, 0.9])).tolist() == [1.0, 0.0] and kept(torch.tensor([0.9])).item() == 1.0
@@ -92,18 +97,51 @@ def test_the_uncertainty_moves_gaussians_only_if_asked(nexus, monkeypatch):
     monkeypatch.setattr(policy, "config", replace(policy.config, through_geometry=True))
     _, whole = policy._weight(step, learn=True)
     assert all(getattr(whole, name).any() for name in GEOMETRY)
-    assert torch.equal(alone.attributes["nexus_doubt"], whole.attributes["nexus_doubt"])
+    assert torch.equal(alone.attributes["nexus_uncertainty"], whole.attributes["nexus_uncertainty"])
 
 
 def test_errors_pull_back_what_is_very_certain(nexus, monkeypatch):
     policy, step = nexus.hooks.mask, nexus.make_step(10, 0)
-    monkeypatch.setattr(policy.effect, "doubts", lambda codes, leaf: 0.1 * codes[:, 0] - 3.9)
+    monkeypatch.setattr(policy.effect, "uncertainty", lambda codes, leaf: 0.1 * codes[:, 0] - 3.9)
     monkeypatch.setattr(policy, "distance", lambda step: torch.ones(step.photo.shape[:2]))
     weight, gradients = policy._weight(step, learn=True)
-    gradient = gradients.attributes["nexus_doubt"][:, 0]
+    gradient = gradients.attributes["nexus_uncertainty"][:, 0]
     assert (
         weight.max() > 3.0 and gradient.min() < 0.0 and gradient.max() <= 1e-9
     )  # a step against it raises sigma
+
+
+def test_the_uncertainty_does_not_read_the_background(nexus, scene, tmp_path, monkeypatch):
+    white = trainer_of(scene, tmp_path, nexus.hooks, behind=255)
+    white.gaussians.attributes["nexus_uncertainty"].copy_(nexus.gaussians.attributes["nexus_uncertainty"])
+    ones = torch.ones(white.data.photos[0].shape[:2])
+    monkeypatch.setattr(white.hooks.mask, "distance", lambda step: ones)
+    found = []
+    for behind in (1.0, 0.0):
+        drawing = white.drawing
+        monkeypatch.setattr(white.hooks.mask, "behind", behind)
+        monkeypatch.setattr(drawing, "hooks", replace(drawing.hooks, background=(behind,) * 3))
+        found.append(white.hooks.mask._weight(white.make_step(10, 0), learn=True))
+    (weight, gradients), (plain, of_plain) = found
+    torch.testing.assert_close(weight, plain, rtol=1e-4, atol=1e-5)
+    one, other = (g.attributes["nexus_uncertainty"] for g in (gradients, of_plain))
+    torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-8)
+
+
+@pytest.mark.parametrize("view", [0, None])
+def test_dropout_follows_the_hidden_layers_in_training_alone(nexus, view):
+    effect, context = nexus.effects.effects[0], replace(nexus.make_step(10, 0), view=view)
+    g, leaf = nexus.gaussians, effect._leaf(nexus.make_step(10, 0))
+    ones = {name: torch.full_like(v, 1.0 if "weight" in name else 0.0) for name, v in leaf.items()}
+    ones["toned_weight0"].zero_(), ones["toned_bias0"].fill_(1.0), ones["toned_weight1"].copy_(torch.eye(8))
+    ones["toned_weight2"].fill_(0.01)
+    base = torch.zeros(len(g), 3)
+    colours = effect.forward(Visible(base, g.means, g.attributes), ones, context)
+    # of 8 units each is kept twice with probability 0.8 and then scaled by 1 / 0.8^2
+    units = torch.logit((colours[:, 0] + 1) / 2) / 0.01 * (0.64 if view == 0 else 1.0)
+    assert units.round().sub(units).abs().max() < 1e-2 and units.max() <= 8.01
+    mean = 8 * 0.64 if view == 0 else 8.0
+    assert float(units.mean()) == pytest.approx(mean, abs=0.3 if view == 0 else 1e-3)
 
 
 def test_boundaries_widen_what_is_kept_and_not_what_is_learnt(nexus, monkeypatch):
@@ -112,7 +150,7 @@ def test_boundaries_widen_what_is_kept_and_not_what_is_learnt(nexus, monkeypatch
     monkeypatch.setattr(policy, "config", replace(policy.config, boundary=True))
     wide, after = policy._weight(step, learn=True)
     torch.testing.assert_close(wide, plain / boundary(*plain.shape, plain))
-    assert torch.equal(before.attributes["nexus_doubt"], after.attributes["nexus_doubt"])
+    assert torch.equal(before.attributes["nexus_uncertainty"], after.attributes["nexus_uncertainty"])
 
 
 def test_boundaries_weigh_least_at_the_lower_middle():
@@ -130,7 +168,7 @@ def test_volumes_are_pulled_down(nexus):
     torch.testing.assert_close(found.log_scales - plain.log_scales, want[:, None].expand(-1, 3))
 
 
-def test_doubts_find_what_features_do_not_explain(scene, tmp_path):
+def test_uncertainty_finds_what_features_do_not_explain(scene, tmp_path):
     options = {"lr_code": "0.02", "appearance": "false", "min_mask_start": "150"}
     trainer = trained(scene, tmp_path, parts_of("nexussplats", **options), iterations=300)
     inside, outside = masked_more_inside(trainer)

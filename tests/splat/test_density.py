@@ -139,9 +139,9 @@ def test_non_finite_rows_are_removed():
     assert torch.isfinite(after.means).all()
 
 
-def resets_of_a_run(iterations: int, stop: float = 1e9) -> tuple[list[int], Gaussians]:
+def resets_of_a_run(iterations: int, stop: float = 1e9, **config: object) -> tuple[list[int], Gaussians]:
     gaussians = model()
-    density = DensityControl(DensityConfig(start=1e9, stop=stop), extent=1.0, seed=0)
+    density = DensityControl(DensityConfig(start=1e9, stop=stop, **config), extent=1.0, seed=0)
     optimiser, fired = SplatAdam(gaussians, RATES), []
     for iteration in range(50, iterations + 1, 50):
         step = step_at(gaussians, iteration, iteration * 30_000 / iterations)
@@ -154,6 +154,8 @@ def test_opacity_resets_fire_as_published_in_a_run_of_full_length():
     fired, gaussians = resets_of_a_run(30_000)
     assert fired == [3000, 6000, 9000, 12_000]
     assert torch.sigmoid(gaussians.opacity_logits).max() <= 0.01 + 1e-6
+    often = [2500, 5000, 7500, 10_000, 12_500, 15_000, 17_500]  # splatfacto-w's
+    assert resets_of_a_run(30_000, resets=tuple(map(float, often)))[0] == often
 
 
 def test_opacity_resets_keep_apart_and_leave_time_to_heal():

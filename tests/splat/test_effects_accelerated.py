@@ -14,7 +14,7 @@ from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.effects.base import RowAdam
 from ambiguous_wild.splat.effects.device_cameras import PosedCamera
 from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
-from ambiguous_wild.splat.effects.poses import PoseRefinement, left_jacobian, turned
+from ambiguous_wild.splat.effects.poses import PoseRefinement, left_jacobian, so3_exp
 from ambiguous_wild.splat.effects.smoothing import filter_sizes
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import NOTHING, Gradients, as_cotangents
@@ -175,11 +175,11 @@ SIZE_OF = {1: SIZE, 2: (SIZE[0] // 2, SIZE[1] // 2)}
 def test_rotations_and_their_jacobian(angle):
     axis = np.array([0.48, -0.6, 0.64])
     w = torch.from_numpy(angle * axis)
-    np.testing.assert_allclose(turned(w), Rotation.from_rotvec(angle * axis).as_matrix(), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(so3_exp(w), Rotation.from_rotvec(angle * axis).as_matrix(), rtol=0, atol=1e-15)
     if angle:
         h = 1e-6
         for k, unit in enumerate(torch.eye(3, dtype=torch.float64)):
-            change = turned(w + h * unit) @ turned(w - h * unit).T / (2 * h)
+            change = so3_exp(w + h * unit) @ so3_exp(w - h * unit).T / (2 * h)
             change = 0.5 * (change - change.T)
             column = torch.stack([change[2, 1], change[0, 2], change[1, 0]])
             torch.testing.assert_close(left_jacobian(w)[:, k], column, rtol=0, atol=1e-8)

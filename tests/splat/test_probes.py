@@ -28,8 +28,8 @@ class Empty(Trainer):
     between_s = 0.0  # pass after a step, before the clock is read again
 
     def __init__(self, config: TrainConfig, folder: Any) -> None:
-        photo = torch.zeros(8, 8, 3)
-        data = SimpleNamespace(scene=SimpleNamespace(extent=1.0), photos=[photo])
+        photo, camera = torch.zeros(8, 8, 3), SimpleNamespace(height=8, width=8)
+        data = SimpleNamespace(scene=SimpleNamespace(extent=1.0), photos=[photo], cameras=[camera])
         self.config, self.folder, self.iteration = config, folder, 0
         self.probe = lambda draw: 20.0 + self.iteration
         self.timeline = Timeline()

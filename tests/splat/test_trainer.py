@@ -8,6 +8,7 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,8 +22,8 @@ from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import shrink, shrink_keep
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
-from ambiguous_wild.splat.pace import Level, ceiling_at, coarse_to_fine, factor_at
+from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks, Schedule
+from ambiguous_wild.splat.pace import Level, Pace, ceiling_at, coarse_to_fine, factor_at
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.training_loop import train
@@ -331,6 +332,13 @@ def test_coarse_to_fine_follows_the_photos_spectrum():
     assert coarse_to_fine([np.full((400, 400, 3), 0.5)]) == (Level(0.0, 1),)
     assert coarse_to_fine([noise[:80, :80]]) == (Level(0.0, 1),)
     assert [factor_at(rough_levels, p) for p in (0.0, 0.5, 1.0)] == [4, 1, 1]
+
+
+def test_the_number_of_gaussians_needs_no_photo():
+    """A photo that does not fit into memory is read from its file."""
+    camera, scene = SimpleNamespace(height=8, width=9), SimpleNamespace(extent=1.0)
+    data = SimpleNamespace(scene=scene, photos=[None], cameras=[camera])
+    assert Pace(TrainConfig(iterations=100), Schedule(), data, start=5, most=100).most == 72
 
 
 def test_the_count_ceiling_rises_with_the_resolution():

@@ -1,6 +1,6 @@
 """The paper's ablations of RefineSplat, and ours, as data. Settings are on top of the defaults.
 
-If the paper varies a loss that is off by default (see config.py), the rows switch it on.
+If the paper varies a loss that is off by default (see hyperparameters.py), the rows switch it on.
 """
 
 from __future__ import annotations
@@ -33,6 +33,10 @@ _ONE_MASK = (
     Variant("global", ("mask.use_local=false",), "(c) M_global alone"),
 )
 _STATISTICS = Variant("t-statistics", ("mask.threshold=statistics",), "T_statistics: mean and deviation")
+_OTHER_DENSITY = (
+    Variant("pup", method="refinesplat@density=pup-3dgs", text="(a)"),
+    Variant("uad", method="refinesplat@density=uad", text="(b); a reading: its formula is unverified"),
+)
 _ALPHA1 = values("alpha1", "lambda_cr", 0.1, 0.2, 0.3)
 _DILATIONS = values("dilation", "mask.dilation", 3, 5, 7)
 _MERGE_THRESHOLD = Group(
@@ -89,8 +93,7 @@ ABLATIONS = (
             Variant("merging", (*_NO_ENTROPY, *_NO_SUPPORT), "(c) merging alone"),
             Variant("both", _NO_SUPPORT, "(d)"),
             Variant("support", ("density.decides=total",), "and Gaussians masked in every photo are removed"),
-            Variant("pup", method="refinesplat@density=pup-3dgs", text="PUP 3D-GS decides who goes"),
-            Variant("uad", method="refinesplat@density=uad", text="ForestSplats' uncertainty-aware density"),
+            *_OTHER_DENSITY,
             # these rows switch the entropy terms on, without which `decides` has no effect
             Variant(
                 "losses-total", (*_PRINTED_LOSSES, "density.decides=total"), "with L_id, L_cr: L decides"
@@ -105,12 +108,7 @@ ABLATIONS = (
     Group(
         "density-control",
         "Density control of others in its place (PUP, UAD); the default is EDC",
-        (
-            Variant("pup", method="refinesplat@density=pup-3dgs", text="(a)"),
-            Variant(
-                "uad", method="refinesplat@density=uad", text="(b); a reading: its formula is unverified"
-            ),
-        ),
+        _OTHER_DENSITY,
         "Tab. comparison of the density control strategy",
     ),
     Group(

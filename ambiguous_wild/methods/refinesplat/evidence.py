@@ -59,7 +59,7 @@ def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float,
     return Maps(statistic.double(), distance.double(), h.double(), cosine.double())
 
 
-def silence(maps: Maps, unseen: Tensor) -> Maps:
+def mask_unlearnt(maps: Maps, unseen: Tensor) -> Maps:
     """Remove the evidence where the model is not learnt yet (bool [h, w]).
 
     A sky without points differs from every photo until it is learnt, and if masked it never would be.

@@ -189,10 +189,6 @@ class Psi(nn.Module):
         standard = (features - self.mean) / self.std
         return self.last(torch.relu(self.first(standard)))
 
-    @property
-    def identities(self) -> int:
-        return self.last.out_features
-
 
 def train_psi(
     features: Tensor,  # [n, C] cells of all photos

@@ -23,7 +23,7 @@ from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.masking_common import PausingMask, resized
 from ambiguous_wild.methods.refinesplat import mask_pictures
 from ambiguous_wild.methods.refinesplat.density_control import EntropyAwareDensity
-from ambiguous_wild.methods.refinesplat.evidence import Maps, compare, silence
+from ambiguous_wild.methods.refinesplat.evidence import Maps, compare, mask_unlearnt
 from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.maps import EnlargedMaps
@@ -246,7 +246,7 @@ class RefineSplatMask(PausingMask):
         maps = compare(frozen.phi[step.view], features(image), frozen.psi, features.unit, mask)
         h, w = maps.distance.shape
         alpha = F.adaptive_avg_pool2d(step.rendered.alpha[None, None], (h, w))[0, 0]
-        return silence(maps, alpha < mask.least_alpha)
+        return mask_unlearnt(maps, alpha < mask.least_alpha)
 
     def _entropy_terms(self, image: Tensor, step: Step, keep: Tensor | None) -> Tensor:
         inputs, config = self.inputs.semantics, self.config

@@ -7,7 +7,7 @@ the vjps by autograd are here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
@@ -294,10 +294,11 @@ def mlp(
     x: Tensor,  # [M, inputs]
     leaf: Mapping[str, Tensor],
     name: str,
+    hidden: Callable[[Tensor], Tensor] = torch.relu,  # applied after every layer but the last
 ) -> Tensor:
-    """Apply the net of `mlp_leaves` with ReLU, [M, outputs]; the last layer has no activation."""
+    """Apply the net of `mlp_leaves`, [M, outputs]; the last layer has no activation."""
     layers = sum(key.startswith(f"{name}_weight") for key in leaf)
     for i in range(layers):
         x = torch.addmm(leaf[f"{name}_bias{i}"], x, leaf[f"{name}_weight{i}"])
-        x = torch.relu(x) if i + 1 < layers else x
+        x = hidden(x) if i + 1 < layers else x
     return x

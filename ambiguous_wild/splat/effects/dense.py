@@ -163,8 +163,8 @@ def _depth(photo: _ReducedPhoto, others: Sequence[_ReducedPhoto], xyz: np.ndarra
     for k, nearness in enumerate(inverse):
         first = np.full(shape, -1.0, np.float32)
         second = first.copy()
-        for other, (turn, shift) in zip(others, parts):
-            warp = turn + nearness * shift
+        for other, (homography, shift) in zip(others, parts):
+            warp = homography + nearness * shift
             score = _correlation(photo.grey, mean, variance, other.shown, warp, WINDOW)
             second = np.maximum(second, np.minimum(first, score))
             first = np.maximum(first, score)
@@ -187,8 +187,8 @@ def _plane_warp(camera: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return A, B [3, 3]: A + B / z maps pixels of a camera, on the plane of depth z, to the other camera."""
     to_other = other.cam_from_world @ np.linalg.inv(camera.cam_from_world)
     inner = _intrinsics(other)
-    turn = inner @ to_other[:3, :3] @ np.linalg.inv(_intrinsics(camera))
-    return turn, np.outer(inner @ to_other[:3, 3], [0.0, 0.0, 1.0])
+    homography = inner @ to_other[:3, :3] @ np.linalg.inv(_intrinsics(camera))
+    return homography, np.outer(inner @ to_other[:3, 3], [0.0, 0.0, 1.0])
 
 
 def _correlation(

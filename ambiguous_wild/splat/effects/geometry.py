@@ -61,7 +61,7 @@ def inside(pixels: Tensor, z: Tensor, camera: Camera, margin: float) -> Tensor:
 
 
 def mean_of_seen(values: Tensor, means: Tensor, camera: Camera) -> Tensor:
-    """Average values over the rows that the camera may see; they are given for those of `Backend.rows`."""
+    """Average values over the rows that the camera may see; they are given for those of `visible_rows`."""
     return backend_of(means.device).mean_of_rows(values, lambda: in_picture(means, camera))
 
 

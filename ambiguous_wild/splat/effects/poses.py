@@ -51,9 +51,9 @@ class PoseRefinement(Effect):
             return context.camera
         full, row = self.cameras[context.view], self.adam.values[context.view]
         base = on_device(full, row.device, row.dtype)
-        turn, pose = turned(row[:3]), base.viewmat[0].clone()
-        pose[:3, :3] = turn @ base.viewmat[0, :3, :3]
-        pose[:3, 3] = turn @ base.viewmat[0, :3, 3] + self.depth * row[3:]
+        rotation, pose = so3_exp(row[:3]), base.viewmat[0].clone()
+        pose[:3, :3] = rotation @ base.viewmat[0, :3, :3]
+        pose[:3, 3] = rotation @ base.viewmat[0, :3, 3] + self.depth * row[3:]
         smaller = context.camera.width / full.width, context.camera.height / full.height
         return PosedCamera(context.camera, pose, scaled(base.intrinsics[0], *smaller))
 
@@ -62,8 +62,8 @@ class PoseRefinement(Effect):
         row = self.adam.values[context.view]
         left = left_gradient(gaussians, context.camera, gradients)
         # the motion is exp(w), then the shift, so the shift's part of the gradient of w is subtracted
-        turn = left[:3] - torch.linalg.cross(self.depth * row[3:], left[3:])
-        return {"motion": torch.cat([left_jacobian(row[:3]).T @ turn, self.depth * left[3:]])}
+        rotation = left[:3] - torch.linalg.cross(self.depth * row[3:], left[3:])
+        return {"motion": torch.cat([left_jacobian(row[:3]).T @ rotation, self.depth * left[3:]])}
 
     def step(
         self, effect_grads: Mapping[str, Tensor], context: ViewContext, skip_step: Tensor | None = None
@@ -111,11 +111,11 @@ def left_gradient(gaussians: Gaussians, camera: Camera, gradients: Gradients) ->
     local = means @ rotation.T + move
     d_local = geometric @ rotation.T
     shift = (d_means @ rotation.T).sum(dim=0)  # a shift changes the direction too, like a shift of the means
-    turn = torch.linalg.cross(local, d_local).sum(dim=0)
-    return torch.cat([turn + rotation @ _turn_of_quats(gaussians, gradients, rows), shift])
+    through_means = torch.linalg.cross(local, d_local).sum(dim=0)
+    return torch.cat([through_means + rotation @ _rotation_of_quats(gaussians, gradients, rows), shift])
 
 
-def _turn_of_quats(gaussians: Gaussians, gradients: Gradients, rows: Rows) -> Tensor:
+def _rotation_of_quats(gaussians: Gaussians, gradients: Gradients, rows: Rows) -> Tensor:
     """Return dL/dw [3] of a rotation of every Gaussian by w in world axes: dq = (0, w) q / 2."""
     q, d = gaussians.quats[rows].double(), gradients.quats[rows].double()
     v, dv = q[:, 1:], d[:, 1:]
@@ -147,7 +147,7 @@ def _hat(vector: Tensor) -> Tensor:
     return torch.linalg.cross(vector.expand(3, 3), eye).T
 
 
-def turned(rotation: Tensor) -> Tensor:
+def so3_exp(rotation: Tensor) -> Tensor:
     """Return exp(w) [3, 3] of a rotation vector [3], rad; smooth at zero, without reading values."""
     a, b, _ = _coefficients(rotation)
     cross = _hat(rotation)

@@ -245,24 +245,6 @@ def test_density_control_gets_what_it_needs_and_may_change_gradients(scene, tmp_
     torch.testing.assert_close(trainer.gaussians.opacity_logits, before - 0.05)  # Adam's first step
 
 
-class Before(DensityControl):
-    before_optimiser = True
-
-
-def test_density_control_may_come_before_the_optimiser(scene, tmp_path):
-    config = replace(EARLY, min_every=3)
-    trainer = trainer_for(
-        scene, tmp_path, parts=MethodHooks(density=Before, density_config=config), max_gaussians=700
-    )
-    while trainer.iteration < 2:
-        trainer.step()
-    means, n = trainer.gaussians.means.clone(), len(trainer.gaussians)
-    trainer.step()
-    assert len(trainer.gaussians) > n  # grew, and what stayed did not move in this step
-    assert set(map(tuple, means.tolist())) & set(map(tuple, trainer.gaussians.means.tolist()))
-    assert trainer.optimiser.steps == 2
-
-
 def test_a_start_of_ones_own(scene, tmp_path):
     def start(data):
         xyz = data.scene.points.xyz[:9]

@@ -20,7 +20,7 @@ import shutil
 import signal
 import sqlite3
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -57,7 +57,8 @@ OCTAVES = 4  # octaves used, from the doubled photo on; features of coarser ones
 GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads
 # Positions per requested feature: COLMAP finishes the octave that exceeds its limit, so it returns more.
 POSITIONS_A_FEATURE = 1.4
-_BLANK = "\x1f"  # for a blank in a name, at which COLMAP splits the lines of a list of pairs
+# For characters of names in a list of pairs: COLMAP splits its lines at blanks, and # begins a comment.
+_ESCAPED = {" ": "\x1f", "#": "\x10"}
 
 
 def sift(gray: np.ndarray, most: int, mask: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -196,14 +197,15 @@ def run_matches(job: MatchJob) -> None:
     else:
         path = database.with_name(PAIRS)
         earlier = Path(job["earlier"]).read_text(encoding="utf-8").splitlines() if job["earlier"] else []
-        likely = [" ".join(name.replace(" ", _BLANK) for name in pair) for pair in _likely_pairs(job)]
+        escapes = str.maketrans(_ESCAPED)
+        likely = [" ".join(name.translate(escapes) for name in pair) for pair in _likely_pairs(job)]
         # COLMAP skips pairs that are matched already.
         path.write_text("".join(f"{line}\n" for line in dict.fromkeys(earlier + likely)), encoding="utf-8")
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = str(path)
-        _replace_in_names(database, " ", _BLANK)
+        _replace_in_names(database, _ESCAPED)
         pycolmap.match_image_pairs(job["database"], matching_options=options, pairing_options=pairing)
-        _replace_in_names(database, _BLANK, " ")
+        _replace_in_names(database, {escaped: plain for plain, escaped in _ESCAPED.items()})
     if job["focals"] is None:  # poses are known: triangulation takes the matches that fit them
         return
     matched = Matched.read(database)
@@ -220,9 +222,10 @@ def run_matches(job: MatchJob) -> None:
     write_json(database.with_name("pairs.json"), counts)
 
 
-def _replace_in_names(database: Path, old: str, new: str) -> None:
+def _replace_in_names(database: Path, new_of: Mapping[str, str]) -> None:
     with closing(sqlite3.connect(database)) as db, db:
-        db.execute("UPDATE images SET name = replace(name, ?1, ?2) WHERE instr(name, ?1)", (old, new))
+        for pair in new_of.items():
+            db.execute("UPDATE images SET name = replace(name, ?1, ?2) WHERE instr(name, ?1)", pair)
 
 
 def _take_out_fixed(job: MatchJob, matched: Matched) -> bool:

@@ -159,9 +159,10 @@ def test_a_test_photo_meets_every_training_photo():
     assert len(pairs) < 60 * 59 / 2
 
 
-def test_names_with_blanks_are_matched_too(tmp_path):
+@pytest.mark.parametrize("start", ["a b ", "#"])
+def test_names_that_a_list_of_pairs_cannot_hold_are_matched_too(start, tmp_path):
     photos = [
-        ScreenedPhoto(source=path.name, name=path.name) for path in write_capture(tmp_path / "raw", 3, "a b ")
+        ScreenedPhoto(source=path.name, name=path.name) for path in write_capture(tmp_path / "raw", 3, start)
     ]
     settings = BuildSettings(matcher="sequential")
     job = StructureFromMotion(

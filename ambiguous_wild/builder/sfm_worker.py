@@ -57,7 +57,8 @@ OCTAVES = 4  # octaves used, from the doubled photo on; features of coarser ones
 GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads
 # Positions per requested feature: COLMAP finishes the octave that exceeds its limit, so it returns more.
 POSITIONS_A_FEATURE = 1.4
-# For characters of names in a list of pairs: COLMAP splits its lines at blanks, and # begins a comment.
+# For characters of names in a list of pairs: COLMAP splits its lines at blanks, and # begins a comment. None
+# of these ends a line for `splitlines`, as "\x1e" does.
 _ESCAPED = {" ": "\x1f", "#": "\x10"}
 
 

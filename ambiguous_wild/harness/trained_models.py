@@ -346,10 +346,8 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
         hooks = entry.build(from_plain(type(entry.options()), options, "options"))
     except AwError as error:  # an option of another version
         hooks, note = entry.build(entry.options()), f"{name} is drawn with its present defaults: {error}"
-    effects, behind = (
-        config.get("effects") or (),
-        section(config, "scene").get("background", hooks.background),
-    )
+    effects = config.get("effects") or ()
+    behind = section(config, "scene").get("background", hooks.background)
     try:
         antialias = hooks.antialias or "antialias" in effects
         red, green, blue = map(float, behind)

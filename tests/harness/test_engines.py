@@ -26,6 +26,7 @@ from tests.tiny_scene import write_tiny_scene
 
 SHORT = TrainConfig(iterations=40)
 HAS_RAY = importlib.util.find_spec("ray") is not None
+NEEDS_RAY = pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed")
 # Writes the renders of its seed, and in the middle kills whoever started it, as often as a file says.
 FRAIL = """
 import os, shutil, signal, sys
@@ -243,11 +244,11 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
         (["--engine", "slurm"], "'local', 'ray'"),
         pytest.param(
             ["--engine", "ray", "--address", "auto", "--jobs", "2"], "--jobs is for this machine",
-            marks=pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed"),
+            marks=NEEDS_RAY,
         ),
         pytest.param(
             ["--engine", "ray", "--set", "engine.transfer=store", "--overwrite", "longer"], "does not send",
-            marks=pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed"),
+            marks=NEEDS_RAY,
         ),
     ],
 )  # fmt: skip

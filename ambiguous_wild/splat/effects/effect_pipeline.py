@@ -171,7 +171,7 @@ class EffectPipeline:
         redraw = any(effect.acts(hook) for effect in fitted for hook in ("model", "shade"))
         rendered = self.render(gaussians, context, draw)
         for _ in range(FIT_STEPS):
-            assert isinstance(rendered, EffectRender)
+            assert isinstance(rendered, EffectRender)  # there are effects
             # "images" blanks both pictures outside of `keep`, so no window of SSIM reaches the other half
             loss = photometric(rendered.image, photo, keep, weighting="images")
             through = rendered.backward if redraw else rendered.through_image_effects

@@ -25,8 +25,7 @@ from ambiguous_wild.splat.train_config import TrainConfig
 from tests.tiny_scene import write_tiny_scene
 
 SHORT = TrainConfig(iterations=40)
-HAS_RAY = importlib.util.find_spec("ray") is not None
-NEEDS_RAY = pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed")
+NEEDS_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra [ray]")
 # Writes the renders of its seed, and in the middle kills whoever started it, as often as a file says.
 FRAIL = """
 import os, shutil, signal, sys
@@ -109,7 +108,7 @@ def test_processes_one_killed_in_the_middle_give_what_one_process_gives(scene, f
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed: extra [ray]")
+@NEEDS_RAY
 def test_ray_one_worker_killed_in_the_middle_gives_what_one_process_gives(scene, frail, local, tmp_path):
     frail[1].write_text("1")
     done = aw_bench(tmp_path, scene, frail[0], "--engine", "ray", "--jobs", 2)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.datasets.foreign import plain
 from ambiguous_wild.harness.store import Runs, check_names
 from ambiguous_wild.report.audit_numbers import MEAN, REPORTED, PrintedNumber, read_tables
 from ambiguous_wild.report.comparison import comparison, quality_columns
@@ -166,11 +167,11 @@ def read_reported(folder: Path | None = None) -> list[PrintedNumber]:
 
 def datasets_of(numbers: Sequence[PrintedNumber], scenes: Sequence[str]) -> dict[str, list[str]]:
     """Group our scenes by the dataset in which a reported table has a scene of the same name."""
-    dataset_of = {_normalised(n.scene): n.dataset for n in numbers if n.known}
+    dataset_of = {plain(n.scene): n.dataset for n in numbers if n.known}
     datasets: dict[str, list[str]] = {}
     for scene in scenes:
-        if _normalised(scene) in dataset_of:
-            datasets.setdefault(dataset_of[_normalised(scene)], []).append(scene)
+        if plain(scene) in dataset_of:
+            datasets.setdefault(dataset_of[plain(scene)], []).append(scene)
     return datasets
 
 
@@ -187,7 +188,7 @@ def with_reported(table: Table, numbers: Sequence[PrintedNumber]) -> Table:
     texts: dict[tuple[str, str, str], dict[str, list[str]]] = {}  # (method, scene, metric) -> by dataset
     for n in numbers:
         if n.known and not n.setting:
-            by_dataset = texts.setdefault((n.method, _normalised(n.scene), n.metric), {})
+            by_dataset = texts.setdefault((n.method, plain(n.scene), n.metric), {})
             by_dataset.setdefault(n.dataset, []).append(n.text)
     rows = []
     for method in dict.fromkeys(key[0] for key in texts):
@@ -204,14 +205,9 @@ def _cell(
 ) -> TableCell:
     family = column.measure.key.partition("_")[0]
     metric = NAMES.get(column.measure.key, family if family in FAMILIES else "")
-    by_dataset = texts.get((method, _normalised(column.scene or MEAN), metric), {})
+    by_dataset = texts.get((method, plain(column.scene or MEAN), metric), {})
     if column.dataset:
         values = by_dataset.get(column.dataset, [])
     else:  # the name identifies a scene without its dataset, but not a mean
         values = [text for of in by_dataset.values() for text in of] if column.scene else []
     return TableCell(printed=" / ".join(dict.fromkeys(values))) if values else BLANK
-
-
-def _normalised(name: str) -> str:
-    """Return a scene's name in lower case with letters and digits only, as its spelling varies."""
-    return "".join(c for c in name.casefold() if c.isalnum())

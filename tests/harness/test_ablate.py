@@ -14,7 +14,7 @@ from ambiguous_wild.harness.cell import reproduce
 from ambiguous_wild.harness.grid import cell_folder, run_cells
 from ambiguous_wild.harness.result_file import write_result
 from ambiguous_wild.harness.store import read_runs
-from ambiguous_wild.methods import MethodEntry, get_method, register, registry
+from ambiguous_wild.methods import MethodEntry, get_method, register
 from ambiguous_wild.methods.ablation_groups import Group, Variant, check_groups, choose_groups
 from ambiguous_wild.report import ablation_report
 from ambiguous_wild.report.ablation_report import markdown_of, write_report
@@ -43,8 +43,7 @@ GROUPS = (
 
 
 @pytest.fixture(autouse=True)
-def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
+def _methods():
     register(
         MethodEntry(
             "mine",

@@ -42,11 +42,6 @@ shutil.copy(photos[seed + 1], output / "1.png")
 """
 
 
-@pytest.fixture(autouse=True)
-def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
-
-
 @pytest.fixture(scope="module")
 def frail(tmp_path_factory):
     """A method's reference, and the file that says how often it kills its worker."""

@@ -40,11 +40,6 @@ BASE = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
-
-
 def describe(folder, **changes):
     path = folder / "nearest.yaml"
     path.write_text(yaml.safe_dump(BASE | changes))

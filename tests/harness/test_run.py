@@ -19,7 +19,7 @@ from ambiguous_wild.harness.result_file import check_model, read_result
 from ambiguous_wild.io.files import folder_lock, sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.ply import read_splat_ply
-from ambiguous_wild.methods import MethodEntry, register, registry
+from ambiguous_wild.methods import MethodEntry, register
 from ambiguous_wild.metrics.image import flip, psnr, psnr_affine
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.train_config import TrainConfig
@@ -45,8 +45,7 @@ def explode(options):
 
 
 @pytest.fixture(autouse=True)
-def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
+def _methods():
     register(MethodEntry("truth", "exact masks", lambda options: MethodHooks(mask=TruthMask())))
     register(MethodEntry("broken", "fails", explode))
 

@@ -1,4 +1,4 @@
-"""What the tests of the baselines share: a trainer on the tiny scene, one step at hand, and its bits."""
+"""What the tests of the baselines share: a trainer on the tiny scene and one step at hand."""
 
 from __future__ import annotations
 
@@ -44,10 +44,6 @@ def trained(scene: Path, folder: Path, parts: MethodHooks, iterations: int = 120
     trainer = trainer_of(scene, folder, parts, iterations, seed)
     train(trainer)
     return trainer
-
-
-def bits(trainer: Trainer) -> dict[str, bytes]:
-    return {name: tensor.numpy().tobytes() for name, tensor in trainer.gaussians.items()}
 
 
 def step_of(

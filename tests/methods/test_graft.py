@@ -24,7 +24,8 @@ from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.colour import AffineExposure
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.train_config import TrainConfig
-from tests.methods.baselines import bits, parts_of, trained
+from tests.methods.baselines import parts_of, trained
+from tests.splat.scenes import bits
 
 TRUE_3DGS = "3dgs@mask=truth"
 

@@ -92,13 +92,6 @@ def test_every_scene_and_seed_has_its_own_folder(scene, tmp_path):
     assert len({cell.identity for cell in cells}) == 6
 
 
-def test_an_unknown_group_is_named(scene):
-    with pytest.raises(AwError, match="did you mean 'size'"):
-        study(scene, groups=["sise"])
-    with pytest.raises(AwError, match="3dgs declares no ablations"):
-        plan_study("3dgs", [scene], [0], SHORT)
-
-
 def test_runs_of_a_study_are_those_of_aw_table_and_are_kept(scene, tmp_path):
     plan = study(scene)
     assert {r.outcome for r in run_cells(plan.cells, tmp_path)} == {"trained"}

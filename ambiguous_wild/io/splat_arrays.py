@@ -104,9 +104,7 @@ def from_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     return quats
 
 
-def checked_transform(
-    offset: Sequence[float], scale: float, quat: Sequence[float] = UNMOVED.quat
-) -> SceneTransform:
+def checked_transform(offset: Sequence[float], scale: float, quat: Sequence[float]) -> SceneTransform:
     """Return the transform that a file records.
 
     Raises:

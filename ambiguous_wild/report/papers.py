@@ -14,7 +14,7 @@ from ambiguous_wild.report.comparison import comparison, quality_columns
 from ambiguous_wild.report.pairs import Ties
 from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableCell
 
-PER_TABLE = 6  # scenes side by side, as in the papers
+PER_TABLE = 6  # scenes side by side, as in the papers; more are several tables, the last with the mean
 FAMILIES = ("psnr", "ssim", "lpips")
 NAMES = {"model_mb": "memory"}  # key of a measure -> its name in papers
 
@@ -31,7 +31,6 @@ def paper(
     metrics: Sequence[str] = (),
     scenes: Sequence[str] = (),
     datasets: Mapping[str, Sequence[str]] | None = None,
-    per_table: int = PER_TABLE,
 ) -> list[Table]:
     """Return tables with scenes side by side, PSNR / SSIM / LPIPS under each, and the mean last.
 
@@ -40,7 +39,6 @@ def paper(
         metrics: columns under each scene; empty = PSNR, SSIM and the LPIPS that was measured.
         scenes: names of scenes to show; empty = all.
         datasets: scenes by dataset. Each dataset has its own tables and mean; other scenes come last.
-        per_table: most scenes of a table; more are divided into several tables, with the mean in the last.
 
     Raises:
         AwError: unknown metric, scene, or a scene in two datasets.
@@ -49,7 +47,7 @@ def paper(
     for name, members, tables in _by_dataset(runs, metrics, scenes, datasets or {}):
         by_scene, mean = (tables[1:], tables[:1]) if len(members) > 1 else (tables, [])
         title = name or (f"{len(members)} scenes" if mean else tables[0].title)
-        chunks = [by_scene[i : i + per_table] for i in range(0, len(by_scene), per_table)]
+        chunks = [by_scene[i : i + PER_TABLE] for i in range(0, len(by_scene), PER_TABLE)]
         for number, chunk in enumerate(chunks, start=1):
             part = f" ({number} of {len(chunks)})" if len(chunks) > 1 else ""
             shown = [(table.title, table) for table in chunk]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -271,7 +271,8 @@ def make_study(
         answers[token] = entry
     # the id depends on the images: the same questions on other renders are another study
     identity = study_id(settings.title, asked, answers, album.hashes)
-    text = page_html({"study": identity, "title": settings.title, "questions": asked, "images": album.images})
+    data = {"study": identity, "title": settings.title, "questions": asked, "images": album.images}
+    text = fill_page(Path(__file__).parent, data, ("page.js",))
     write_text(page, text)  # before the key, so that there is no key without a page
     write_json(
         key,
@@ -348,11 +349,3 @@ def _pair(
     entry = {"kind": KIND_PAIR, "scene": question.scene, "view": question.view,
              "x": question.methods[order[0]], "y": question.methods[order[1]]}  # fmt: skip
     return images, entry
-
-
-def page_html(data: Mapping[str, object]) -> str:
-    """Return the HTML page with its data, escaped so that it cannot end its script element.
-
-    `data`: study, title, the questions, and the data URI of each image by its token.
-    """
-    return fill_page(Path(__file__).parent, data, ("page.js",))

@@ -40,7 +40,8 @@ def test_a_file_holds_what_would_be_printed_in_the_format_of_its_suffix(
     out, _ = aw_table(runs, "--format", style)
     words = ["--format", style] if name == "t.x" else []
     printed, err = aw_table(runs, *words, "-o", tmp_path / "out" / name)
-    assert printed == "" and "2 methods, 1 scene, " in err
+    assert printed == "" and f"wrote {tmp_path / 'out' / name}: " in err
+    assert ("2 methods, 1 scene, " in err) == (style != "html")
     assert (tmp_path / "out" / name).read_text() == out
 
 

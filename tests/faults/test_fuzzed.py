@@ -143,7 +143,7 @@ def test_a_message_stays_one_that_can_be_read():
     assert len(str(caught.value)) < 2500
 
 
-def test_image_headers_say_the_size_the_decoder_finds(tmp_path):
+def test_image_headers_say_the_size_the_decoder_finds():
     import cv2
 
     pixels = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)

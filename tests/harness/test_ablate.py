@@ -219,7 +219,7 @@ def test_the_printed_threshold_is_ablated_without_what_would_hide_it():
         assert (mask.threshold, mask.gate, mask.floor, mask.ceiling) == ("literal", 0.0, 0.0, 0.0)
 
 
-def test_a_graft_of_the_method_is_a_row_with_settings(scene, tmp_path):
+def test_a_graft_of_the_method_is_a_row_with_settings(scene):
     """The method's masks or density in another method: the study's settings and the variant's reach them."""
     rows = (
         Variant("plain", method="3dgs"),

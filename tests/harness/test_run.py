@@ -245,7 +245,7 @@ def test_a_changed_file_is_named_and_trained_again_alone(scene, tmp_path):
         bench(scene, tmp_path / "runs", "3dgs", train=longer, overwrite="changed")
 
 
-def test_a_run_that_succeeds_after_a_failure_leaves_no_trace_of_it(scene, tmp_path, monkeypatch):
+def test_a_run_that_succeeds_after_a_failure_leaves_no_trace_of_it(scene, tmp_path):
     bench(scene, tmp_path, "broken")
     register(MethodEntry("broken", "mended", lambda options: MethodHooks()))
     (cell,), (report,) = bench(scene, tmp_path, "broken")
@@ -337,7 +337,7 @@ def test_a_run_folder_that_is_a_link_is_trained_where_it_leads(scene, tmp_path):
     assert (tmp_path / "runs/scene/3dgs/seed0").is_symlink()
 
 
-def test_photos_too_small_to_be_measured_are_said_before_training(scene, tmp_path):
+def test_photos_too_small_to_be_measured_are_said_before_training(tmp_path):
     small = write_tiny_scene(tmp_path / "small")
     for path in (small / "images").iterdir():
         cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (12, 9)))

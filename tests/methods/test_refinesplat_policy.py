@@ -311,7 +311,7 @@ def test_identities_scale_the_evidence_of_pixels(scene):
     assert np.median(ratio[truth]) > 1.0 > np.median(ratio[~scene.truths[0]])
 
 
-def test_ids_of_a_whole_scene_are_identities(scene, tmp_path):
+def test_ids_of_a_whole_scene_are_identities(scene):
     class Follower:
         name = "follower"
 

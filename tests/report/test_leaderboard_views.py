@@ -289,7 +289,7 @@ def downloads(page: Browser, files: Path) -> None:
     assert [c["method"] for c in cells] == ["refinesplat", "3dgs"] and float(cells[0]["yard"]) > 30
 
 
-def test_sources_that_are_no_such_file_are_refused(board: Path, tmp_path: Path) -> None:
+def test_sources_that_are_no_such_file_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "sources.json"
     assert read_sources(path) == {}
     path.write_text(json.dumps({"papers": {}, "tables": {"t": {"paper": "gone"}}}))

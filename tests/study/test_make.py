@@ -107,7 +107,7 @@ def test_the_same_seed_makes_the_same_files_and_another_another(
     assert (tmp_path / "a.key.json").read_text() == (tmp_path / "b.key.json").read_text()
 
 
-def test_drawing_is_even_over_pairs(tmp_path: Path) -> None:
+def test_drawing_is_even_over_pairs() -> None:
     pairs = [
         PairQuestion(s, str(v), m, (Path("a"), Path("b")), None)
         for s in ("s", "t")

@@ -66,16 +66,6 @@ def step_of(
     )
 
 
-def same(a: object, b: object) -> bool:
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
-        return len(a) == len(b) and all(map(same, a, b))
-    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
-        return torch.equal(a, b)
-    return bool(a == b)
-
-
 def masked_more_inside(trainer: Trainer) -> tuple[float, float]:
     """Mean keep on the red squares, and elsewhere."""
     inside, outside = [], []

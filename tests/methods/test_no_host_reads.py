@@ -13,7 +13,8 @@ from ambiguous_wild.methods.robustsplat import RobustSplatConfig
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.step import Step
 from tests.host_reads import READ, moved, no_transfers, on_accelerator
-from tests.methods.baselines import data_of, parts_of, same, step_of
+from tests.methods.baselines import data_of, parts_of, step_of
+from tests.splat.scenes import same
 from tests.tiny_scene import TRAIN
 
 STEPS = 8

@@ -24,7 +24,7 @@ from ambiguous_wild.splat.optim import SplatAdam
 from tests.methods.on_device import LOOK, MOST, PLAIN, capture, differing, noise, on, tensor, visit
 from tests.methods.test_refinesplat_pixels import asked, others_of, store
 from tests.methods.test_refinesplat_pixels import camera as side_camera
-from tests.methods.test_refinesplat_policy import FAST, HEIGHT, VIEWS, WIDTH, fresh
+from tests.methods.test_refinesplat_policy import FAST, HEIGHT, VIEWS, WIDTH, fresh, plain
 from tests.splat import scenes
 
 
@@ -279,14 +279,6 @@ def test_a_run_goes_on_on_the_other_machine(scene, monkeypatch, begins_there):
         expected = begun.keep(step)
         on(monkeypatch, not begins_there)
         assert differing(expected, resumed.keep(step)) <= MOST
-
-
-def plain(value):
-    if isinstance(value, torch.Tensor):
-        return str(value.dtype), value.tolist()
-    if isinstance(value, dict):
-        return {key: plain(v) for key, v in sorted(value.items())}
-    return value
 
 
 @pytest.mark.parametrize(("statistic", "shown"), [("structure", "evidence"), ("entropy", "entropy")])

@@ -105,8 +105,8 @@ def test_an_interrupted_publish_leaves_the_old_page(
         aw("publish", "--board", board, "-o", out, "--title", "new")
     assert content(out) == before and [p.name for p in tmp_path.iterdir()] == ["site"]
     # Killed between its two renames: the next call puts the old page back before anything else.
-    (tmp_path / ".site.old-1").mkdir()
-    os.replace(out, tmp_path / ".site.old-1" / "site")
+    (tmp_path / ".site.old-k3x_9abc").mkdir()
+    os.replace(out, tmp_path / ".site.old-k3x_9abc" / "site")
     with monkeypatch.context() as patch:
         patch.setattr(publishing, "page", broken)
         aw("publish", "--board", board, "-o", out)

@@ -18,10 +18,16 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from ambiguous_wild.splat import backend
+
 READ = "(?i)meta|host"  # what torch, and `no_transfers`, say of a step that does not leave it alone
 
 _PLAIN = (str, bytes, int, float, bool, type(None), type, np.ndarray, np.generic, FunctionType, MethodType,
           ModuleType, BuiltinFunctionType, torch.dtype, torch.Generator)  # fmt: skip
+
+
+def on_accelerator(monkeypatch: pytest.MonkeyPatch, yes: bool = True) -> None:
+    monkeypatch.setattr(backend, "accelerated", lambda _: yes)
 
 
 def moved(thing: Any, device: str = "meta", done: dict[int, Any] | None = None) -> Any:

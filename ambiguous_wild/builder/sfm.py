@@ -32,7 +32,7 @@ from ambiguous_wild.builder.records import (
 from ambiguous_wild.builder.retrieval import PAIRS, RELATIVE_POSES
 from ambiguous_wild.builder.settings import BuildSettings, SfmPlan
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.processes import python_command
+from ambiguous_wild.core.processes import last_lines, python_command
 from ambiguous_wild.io.colmap_records import ColmapModel
 from ambiguous_wild.io.files import write_json
 
@@ -371,8 +371,9 @@ def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
                 process.wait()
     work.unlink()
     if code != 0:
+        (*_, last) = last_lines(log) or ["its log is empty"]
         raise SfmCrash(
-            f"COLMAP ended with code {code} while computing {job['task']}: {_last_line(log)} "
+            f"COLMAP ended with code {code} while computing {job['task']}: {last[-200:]} "
             f"(log: {_kept_log(folder)}); run the same command again: it continues before this step"
         )
 
@@ -380,11 +381,6 @@ def run_job(job: SfmJob, folder: Path, watch: Callable[[], None]) -> None:
 def _kept_log(folder: Path) -> Path:
     """Copy the log beside the stage's folder, which is removed after an error."""
     return Path(shutil.copyfile(folder / LOG, folder.parent / LOG))
-
-
-def _last_line(log: Path) -> str:
-    lines = [s for s in log.read_text(encoding="utf-8", errors="replace").splitlines() if s.strip()]
-    return lines[-1][-200:] if lines else "its log is empty"
 
 
 def _count(database: Path, table: str) -> int:

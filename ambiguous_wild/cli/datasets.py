@@ -338,12 +338,15 @@ def _print_captures(folder: Path, found: VerifiedCaptures, as_json: bool) -> Non
     Raises:
         AwError: one is damaged.
     """
+    from ambiguous_wild.datasets.capture_hashes import list_lines
+
+    lines = list_lines(found.checked)
     if as_json:
         hashes = {capture.name: capture.sha256 for capture in found.checked}
-        facts = {"absent": found.absent, "damaged": found.damaged, "warnings": found.lines}
+        facts = {"absent": found.absent, "damaged": found.damaged, "warnings": lines}
         click.echo(json.dumps({"listed": {found.width: hashes}, **facts}, indent=2, ensure_ascii=False))
     else:
-        for line in found.lines:
+        for line in lines:
             say(line, out=True)
         if found.absent:
             say(f"absent: {shortlist(found.absent, 20)}; 'aw fetch {found.suite.name}' makes them", out=True)

@@ -165,8 +165,7 @@ def make_command(
 @json_option
 def score_command(answers: tuple[Path, ...], key: Path, output: Path | None, as_json: bool) -> None:
     """Score ANSWERS: files (JSON or CSV) saved by raters, or folders of them."""
-    from ambiguous_wild.io.files import check_output, is_record, refuse_files_there
-    from ambiguous_wild.io.files import refuse_foreign_files as refuse_strangers
+    from ambiguous_wild.io.files import check_output, is_record, refuse_files_there, refuse_foreign_files
     from ambiguous_wild.study.answers import read_answers, read_key
     from ambiguous_wild.study.score_report import SCORE_FILES, markdown_of, write_scores
     from ambiguous_wild.study.scores import score
@@ -175,7 +174,7 @@ def score_command(answers: tuple[Path, ...], key: Path, output: Path | None, as_
     raters = read_answers(answers, key_of_study, lambda text: say(f"warning: {text}"))
     folder = output or key.with_name(key.name.removesuffix(".json").removesuffix(".key") + "-scores")
     if folder.is_dir():
-        refuse_strangers(folder, SCORE_FILES)
+        refuse_foreign_files(folder, SCORE_FILES)
         if not is_record(folder / "scores.json", "raters"):
             refuse_files_there(folder, SCORE_FILES)
     check_output(folder)

@@ -1,10 +1,11 @@
-"""Python processes that a command starts."""
+"""Processes that a command starts: those of Python, and what a log says at its end."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -12,6 +13,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _CLONE = str(Path(__file__).parents[2])
+_TAIL_BYTES = 8192
+_ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
 
 
 def python_command(code: str, *words: str) -> list[str]:
@@ -76,3 +79,13 @@ def python_meanwhile(
     finally:
         process.kill()
         process.wait()
+
+
+def last_lines(log: Path) -> list[str]:
+    """Return what the last "$ COMMAND" of a log wrote at its end, without the escapes of a terminal."""
+    with open(log, "rb") as f:
+        f.seek(max(0, log.stat().st_size - _TAIL_BYTES))
+        text = f.read().decode(errors="replace")
+    lines = [_ESCAPES.sub("", line).strip() for line in re.split(r"[\r\n]+", text)]
+    begun = max((k for k, line in enumerate(lines) if line.startswith("$ ")), default=-1)
+    return [line for line in lines[begun + 1 :] if line]

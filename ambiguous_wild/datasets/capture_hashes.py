@@ -111,7 +111,8 @@ def check_capture(capture: Path, name: str, suite: Suite) -> CheckedCapture:
             f"{capture} holds another capture than {suite.name} has ({', '.join(other)}): move it away, then "
             f"'aw fetch {suite.name}' makes the right one"
         )
-    wrong = [n for n, digest in files.items() if not _is_file(capture / n, digest)]
+    paths = {n: capture / n for n in files}
+    wrong = [n for n, path in paths.items() if not path.is_file() or sha256_file(path) != files[n]]
     if wrong:
         raise AwError(
             f"{capture} is damaged ({counted(len(wrong), 'file')} absent or changed: {shortlist(wrong, 3)}): "
@@ -120,10 +121,6 @@ def check_capture(capture: Path, name: str, suite: Suite) -> CheckedCapture:
     by = version.get("ambiguous_wild") if isinstance(version, dict) else None
     listed = listed_hashes().get(str(made.width), {}).get(name, "")
     return CheckedCapture(name, capture_hash(capture), listed, spec, str(by))
-
-
-def _is_file(path: Path, digest: object) -> bool:
-    return path.is_file() and sha256_file(path) == digest
 
 
 def list_lines(checked: Sequence[CheckedCapture]) -> list[str]:
@@ -154,11 +151,6 @@ class VerifiedCaptures:
     def width(self) -> str:
         """The key of the suite's captures in the list."""
         return str(self.suite.simulated.width) if self.suite.simulated else ""
-
-    @property
-    def lines(self) -> list[str]:
-        """Warnings, see `list_lines`."""
-        return list_lines(self.checked)
 
 
 def suite_of_captures(folder: Path) -> Suite | None:

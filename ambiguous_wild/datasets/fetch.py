@@ -203,7 +203,7 @@ def _transfer(
     """Make one request, and append its bytes to `part`.
 
     Raises:
-        _Broken: it ended early, or the connection failed.
+        _TransferBroken: it ended early, or the connection failed.
         AwError: the server refuses, or announces another file than the first download.
     """
     have = part.stat().st_size if part.is_file() else 0

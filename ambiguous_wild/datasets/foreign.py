@@ -11,6 +11,7 @@ import numpy as np
 
 from ambiguous_wild.core.camera import pose_at
 from ambiguous_wild.core.errors import AwError, shortlist
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.core.names import stays_below
 from ambiguous_wild.core.scene import Evaluation, Split
 from ambiguous_wild.io.colmap_records import LARGEST_COORDINATE, ColmapModel
@@ -88,9 +89,9 @@ def split_by_lists(
     in_model = list(names)
     exact, by_key, by_base, by_any_case = (
         set(in_model),
-        _index(in_model, key),
-        _index(in_model, lambda n: key(PurePosixPath(n).name)),
-        _index(in_model, lambda n: key(n).casefold()),
+        grouped(in_model, key),
+        grouped(in_model, lambda n: key(PurePosixPath(n).name)),
+        grouped(in_model, lambda n: key(n).casefold()),
     )
     split: dict[str, Split] = {}
     missing: dict[Split, list[str]] = {}
@@ -117,13 +118,6 @@ def split_by_lists(
                 "belongs to another scene"
             )
     return split, missing
-
-
-def _index(names: Iterable[str], key: Callable[[str], str]) -> dict[str, list[str]]:
-    names_of: dict[str, list[str]] = {}
-    for name in names:
-        names_of.setdefault(key(name), []).append(name)
-    return names_of
 
 
 def pose_from_opengl(matrix: np.ndarray) -> np.ndarray:

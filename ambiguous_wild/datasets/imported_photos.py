@@ -48,7 +48,6 @@ class PhotoPlan:
     source: Path
     camera: ModelCamera  # at the size of `source`
     small: Path | None  # a downsampled copy that is linked
-    only_small: bool  # the dataset has downsampled photos only
     convert: bool  # its pixels change, so a PNG is written
     orientation: int = 1  # EXIF orientation that was applied to the model's photo; COLMAP applies none
 
@@ -99,7 +98,7 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
     Raises:
         AwError: photos are absent, are no images, or have another shape than their cameras.
     """
-    folder, only_small = scene.photo_folder, scene.only_small
+    folder = scene.photo_folder
     absent, wrong, plans = [], [], []
     for image in sorted(scene.model.images.values(), key=lambda i: i.name):
         if image.name not in scene.split:
@@ -122,7 +121,7 @@ def plan_photos(scene: ForeignScene) -> list[PhotoPlan]:
             wrong.append(f"{image.name} ({size[0]}x{size[1]}, {needed})")
         else:
             size = size[::-1] if tag > 4 else size
-            plans.append(_plan(scene, image, source, camera, size, only_small, tag))
+            plans.append(_plan(scene, image, source, camera, size, tag))
     refuse_same_stems(scene.root, sorted(scene.split))
     total = len(scene.split)
     if absent:
@@ -182,7 +181,6 @@ def _plan(
     source: Path,
     camera: ModelCamera,
     size: tuple[int, int],
-    only_small: bool,
     tag: int,
 ) -> PhotoPlan:
     lens = lens_of(resized(camera, *size)) if camera.model not in PINHOLES else None
@@ -195,7 +193,7 @@ def _plan(
         or bool(file_colours(source).name)
     )
     small = None
-    if scene.factor > 1 and not convert and not only_small:
+    if scene.factor > 1 and not convert and not scene.only_small:
         small = find_photo(scene.root / f"images_{scene.factor}", image.name)
         found = header_size(small) if small is not None else None
         if found is not None and not _same_shape(found, size):
@@ -203,8 +201,8 @@ def _plan(
                 f"{small} is {found[0]}x{found[1]}, another shape than {source} ({size[0]}x{size[1]}): it is "
                 f"no copy of it; remove images_{scene.factor} to make it anew"
             )
-    at_size = camera if not (convert or only_small) else resized(camera, *size)
-    return PhotoPlan(image, source, at_size, small, only_small, convert, tag)
+    at_size = camera if not (convert or scene.only_small) else resized(camera, *size)
+    return PhotoPlan(image, source, at_size, small, convert, tag)
 
 
 @lru_cache(maxsize=4)  # a map of a photo of 12 megapixels takes 98 MB
@@ -248,8 +246,8 @@ def place_photo(plan: PhotoPlan, scene: ForeignScene, folder: Path) -> PlacedPho
     stem = without_suffix(plan.image.name)
     lens = lens_of(plan.camera)
     notes: list[str] = []
-    full = folder / (f"images_{scene.factor}" if plan.only_small else "images")
-    factor = 1 if plan.only_small else scene.factor
+    full = folder / (f"images_{scene.factor}" if scene.only_small else "images")
+    factor = 1 if scene.only_small else scene.factor
     pinhole = lens.pinhole
     if not plan.convert:
         name = _as(plan.image.name, plan.source.suffix)
@@ -359,7 +357,7 @@ def place_mask(plan: PhotoPlan, placed: PlacedPhoto, scene: ForeignScene, folder
         pixels = upright(pixels, turned)
         height, width = pixels.shape
     final = (placed.camera.width, placed.camera.height)
-    if scene.factor > 1 and not plan.only_small:
+    if scene.factor > 1 and not scene.only_small:
         final = downsampled_size(*final, scene.factor)
     if (width, height) == size:
         flat = lens_of(plan.camera).remap(pixels, nearest=True) if plan.convert else pixels

@@ -27,21 +27,17 @@ class VerifiedPackage:
     warnings: list[str] = field(default_factory=list)  # why a whole package is not ready for release
 
 
-def verify(path: Path, *, scratch: Path | None = None) -> VerifiedPackage:
+def verify(path: Path) -> VerifiedPackage:
     """Check checksums, tables, metadata and every scene of a package folder, or one scene's archive.
 
     Archives are unpacked into a temporary folder, which is removed.
-
-    Args:
-        path: the folder or the .zip.
-        scratch: where to unpack; None = the system's temporary folder.
 
     Raises:
         AwError: the first error, with its file.
     """
     if path.is_file():
         verified = VerifiedPackage()
-        _scene(path, None, verified, scratch)
+        _scene(path, None, verified)
         return verified
     if not path.is_dir():
         raise AwError(f"there is no package {path}")
@@ -66,7 +62,7 @@ def verify(path: Path, *, scratch: Path | None = None) -> VerifiedPackage:
     verified = VerifiedPackage()
     for name in sorted(sums):
         if name.endswith(".zip"):
-            _scene(path / name, {r["path"]: r for r in rows if r["archive"] == name}, verified, scratch)
+            _scene(path / name, {r["path"]: r for r in rows if r["archive"] == name}, verified)
     if not verified.scenes:
         raise AwError(f"{path} holds no scene")
     if NOT_FOR_RELEASE in (path / "README.md").read_text(encoding="utf-8"):
@@ -124,10 +120,8 @@ def _rows(path: Path) -> list[dict[str, str]]:
     return rows
 
 
-def _scene(
-    archive: Path, rows: dict[str, dict[str, str]] | None, found: VerifiedPackage, scratch: Path | None
-) -> None:
-    with tempfile.TemporaryDirectory(prefix="aw-verify-", dir=scratch) as temporary:
+def _scene(archive: Path, rows: dict[str, dict[str, str]] | None, found: VerifiedPackage) -> None:
+    with tempfile.TemporaryDirectory(prefix="aw-verify-") as temporary:
         folder = Path(temporary) / "scene"
         extract(archive, folder)
         tops = sorted(p.name for p in folder.iterdir())

@@ -38,7 +38,7 @@ def locate(root: Path, names: Sequence[str]) -> LocatedPhotos:
     folders, reduced = _folders(root)
     best = LocatedPhotos(root / "images", dict(zip(names, map("/".join, parts))), 0)
     for folder in (*folders, *reduced):
-        if best.found and not _is_preferred(folder, root):
+        if best.found and folder not in {root / name for name in PREFERRED}:
             break  # other folders may hold pictures of the same names: masks, depth
         for drop in range(shared + 1):
             tails = ["/".join(path[drop:]) for path in parts]
@@ -51,10 +51,6 @@ def locate(root: Path, names: Sequence[str]) -> LocatedPhotos:
             if found == len(names):
                 return best
     return best
-
-
-def _is_preferred(folder: Path, root: Path) -> bool:
-    return folder in {root / name if name else root for name in PREFERRED}
 
 
 def find_photo(folder: Path, name: str) -> Path | None:
@@ -85,7 +81,7 @@ def _photos_by_stem(folder: Path, _mtime_ns: int) -> dict[str, Path]:
 
 def _folders(root: Path) -> tuple[list[Path], list[Path]]:
     """Return the folders that may hold photos, and those of reduced copies, images_N."""
-    named = [root / name if name else root for name in PREFERRED]
+    named = [root / name for name in PREFERRED]
     others = sorted(p for p in root.iterdir() if p.is_dir() and p.name[0] != "." and p not in named)
     reduced = [p for p in others if p.name.startswith("images_")]
     others = [p for p in others if p not in reduced and p.name.lower() not in NO_PHOTOS]

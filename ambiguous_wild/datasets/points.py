@@ -102,8 +102,8 @@ def triangulate(
         jobs: threads of features and matching.
         bar: progress.
 
-        Returns:
-            The same cameras and poses, with points; without any if fewer than `MIN_POINTS` were found.
+    Returns:
+        The same cameras and poses, with points; without any if fewer than `MIN_POINTS` were found.
     """
     used = {i.name: i for i in model.images.values() if i.name in split}
     database = _match_posed(folder, model, photos, split, "thorough", seed, jobs, bar)
@@ -148,8 +148,8 @@ def find_motion(
         jobs: threads.
         bar: progress.
 
-        Returns:
-            Numbers of static and moving features, and photos whose poses optical flow does not fit.
+    Returns:
+        Numbers of static and moving features, and photos whose poses optical flow does not fit.
 
     Raises:
         AwError: the poses do not fit the photos' own matches.

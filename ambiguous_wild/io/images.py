@@ -284,11 +284,6 @@ def write_png(
         raise AwError(f"{path}: a PNG takes uint8 or uint16 pixels, got {image.dtype} {list(image.shape)}")
     if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
         raise AwError(f"{path}: a PNG takes [H, W] or [H, W, 3], got {list(image.shape)}")
-    data = _encode_png(path, image, compressed)
-    write_bytes(path, [data])
-
-
-def _encode_png(path: Path | str, image: np.ndarray, compressed: bool) -> bytes:
     import cv2
 
     pixels = image[:, :, ::-1] if image.ndim == 3 else image
@@ -298,7 +293,7 @@ def _encode_png(path: Path | str, image: np.ndarray, compressed: bool) -> bytes:
     done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), options)
     if not done:
         raise AwError(f"{path}: OpenCV could not encode {list(image.shape)} {image.dtype} as PNG")
-    return data.tobytes()
+    write_bytes(path, [data.tobytes()])
 
 
 def decode(
@@ -313,25 +308,18 @@ def decode(
     """
     import cv2
 
-    if not _sound(data, where):
-        return None
-    try:
-        return cv2.imdecode(data, flags)
-    except cv2.error:
-        return None
-
-
-def _sound(data: np.ndarray, where: str) -> bool:
-    """Tell whether the format is supported; raise AwError where the header announces too many pixels."""
     size = header_size(data.tobytes())
     if size is None:  # OpenCV decodes a dozen more formats, which are not needed
-        return False
+        return None
     if size[0] * size[1] > MAX_PIXELS:
         raise AwError(
             f"{where} announces {size[0]}x{size[1]} px, more than the limit of {MAX_PIXELS // 1_000_000} "
             "megapixels; reduce it"
         )
-    return True
+    try:
+        return cv2.imdecode(data, flags)
+    except cv2.error:
+        return None
 
 
 def _decode(

@@ -44,7 +44,9 @@ def kernel_files() -> list[Path]:
 
 def kernel_cache() -> Path:
     """Return the folder of compiled kernels: in NUMBA_CACHE_DIR, else in the home cache, else temporary."""
-    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {_processor()}".encode())
+    host = llvmlite.binding
+    processor = f"{host.get_host_cpu_name()} {host.get_host_cpu_features().flatten()}"
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {processor}".encode())
     for path in [*kernel_files(), *(_PACKAGE / name for name in _OPTIONS)]:
         digest.update(path.read_bytes())
     name = f"kernels-{digest.hexdigest()[:12]}"
@@ -84,10 +86,6 @@ def lifetime(folder: Path) -> str:
         when = "at every command" if own else f"again when {place} is emptied"
         when += ", as no cache in the home folder can be written"
     return f"{when}: set NUMBA_CACHE_DIR to a folder that can"
-
-
-def _processor() -> str:
-    return f"{llvmlite.binding.get_host_cpu_name()} {llvmlite.binding.get_host_cpu_features().flatten()}"
 
 
 def _private_temporary() -> Path:

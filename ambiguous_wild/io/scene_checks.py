@@ -239,9 +239,7 @@ def _any_share(scene: Scene, xyz: np.ndarray, share: float) -> bool:
     """Whether more than a share of the points [N, 3] lie in any training photo."""
     seen = np.zeros(len(xyz), bool)
     for view in scene.train:
-        camera = view.camera
-        u, v = camera.project(xyz)[0].T
-        seen |= (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        seen |= view.camera.has(*view.camera.project(xyz))
         if seen.mean() > share:
             return True
     return False

@@ -13,6 +13,7 @@ from ambiguous_wild.core import UNMOVED, SceneTransform
 Arrays = Mapping[str, np.ndarray]  # raw parameters as `io.ply.read_splat_ply` gives them
 SH_C0 = 0.28209479177387814
 _NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
+_OTHERS = np.array([[j for j in range(4) if j != i] for i in range(4)])  # of four components, all but one
 _MAX_LOGIT = 15.0  # its sigmoid is 3e-7 below 1; formats that store alpha cannot hold an infinite logit
 
 
@@ -91,23 +92,19 @@ def largest_first(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     largest = np.abs(quats).argmax(axis=1)
     rows = np.arange(len(quats))
     signed = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
-    others = np.array([[j for j in range(4) if j != i] for i in range(4)])
-    return largest, np.take_along_axis(signed, others[largest], axis=1)
+    return largest, np.take_along_axis(signed, _OTHERS[largest], axis=1)
 
 
 def from_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the quaternions [N, 4] for a result of `largest_first`."""
     quats = np.empty((len(largest), 4))
-    places = np.array([[j for j in range(4) if j != i] for i in range(4)])
-    np.put_along_axis(quats, places[largest], others, axis=1)
+    np.put_along_axis(quats, _OTHERS[largest], others, axis=1)
     rest = np.sqrt(np.clip(1.0 - (others**2).sum(axis=1), 0.0, None))
     quats[np.arange(len(largest)), largest] = rest
     return quats
 
 
-def checked_transform(
-    offset: Sequence[float], scale: float, quat: Sequence[float] = UNMOVED.quat
-) -> SceneTransform:
+def checked_transform(offset: Sequence[float], scale: float, quat: Sequence[float]) -> SceneTransform:
     """Return the transform that a file records.
 
     Raises:

@@ -24,7 +24,7 @@ from ambiguous_wild.core import AwError, View
 from ambiguous_wild.core.config import Facts, config_hash, from_plain, to_plain
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.core.names import check_name
-from ambiguous_wild.core.processes import git_commit
+from ambiguous_wild.core.processes import git_commit, last_lines
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.files import own_json, sha256_file, write_json
 from ambiguous_wild.methods.entry import MethodEntry, NoOptions
@@ -34,7 +34,6 @@ from ambiguous_wild.methods.external_process import (
     Produced,
     Task,
     end_left_over,
-    last_line,
     no_parts,
     run_logged,
     split_lists,
@@ -233,7 +232,7 @@ class CommandProgram:
     def _revision(self, task: Task) -> str | None:
         """Return what the program calls its version; else the commit of `cwd`, unless that is our own."""
         if self.keys.version:
-            return last_line(task.logs / "version.log") or None
+            return "".join(last_lines(task.logs / "version.log")[-1:]) or None
         return git_commit(self.cwd) if self.cwd != PACKAGED.resolve() else None
 
     def _collect(self, task: Task, values: dict[str, object], done: dict[str, float]) -> Produced:

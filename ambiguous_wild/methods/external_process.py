@@ -12,7 +12,6 @@ import glob
 import json
 import os
 import platform
-import re
 import shlex
 import shutil
 import signal
@@ -25,6 +24,7 @@ from typing import Any, Literal, NoReturn, Protocol
 
 from ambiguous_wild.core import UNMOVED, AwError, Scene, View
 from ambiguous_wild.core.config import Facts
+from ambiguous_wild.core.processes import last_lines
 from ambiguous_wild.io.colmap_model import write_views
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.images import image_size
@@ -36,8 +36,7 @@ WORK, LOGS = "external", "logs"  # folders of a run for the program's output and
 DONE = "done.json"  # in WORK: the finished commands, and their seconds
 GRACE_S = 10.0  # seconds between SIGTERM and SIGKILL
 _RECORD = ".running.json"  # record of a running command, beside its log
-_TAIL_BYTES, _TAIL_LINES = 8192, 4
-_ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
+_TAIL_LINES = 4
 
 
 def stage(scene: Scene, folder: Path, files: Mapping[str, str], *, photos: Photos = "all") -> Path:
@@ -241,24 +240,9 @@ def run_logged(
     return time.perf_counter() - begin
 
 
-def last_line(log: Path) -> str:
-    """Return the last line that a command of `run_logged` wrote; empty if it wrote none."""
-    return "".join(_last_lines(log)[-1:])
-
-
 def _tail(log: Path) -> str:
     """Return "last lines of LOG: ..." as one line."""
-    return f"last lines of {log}: " + (" | ".join(_last_lines(log)[-_TAIL_LINES:]) or "(it wrote nothing)")
-
-
-def _last_lines(log: Path) -> list[str]:
-    """Return what the last command wrote at its end, without the escapes of a terminal."""
-    with open(log, "rb") as f:
-        f.seek(max(0, log.stat().st_size - _TAIL_BYTES))
-        text = f.read().decode(errors="replace")
-    lines = [_ESCAPES.sub("", line).strip() for line in re.split(r"[\r\n]+", text)]
-    begun = max((k for k, line in enumerate(lines) if line.startswith("$ ")), default=-1)
-    return [line for line in lines[begun + 1 :] if line]
+    return f"last lines of {log}: " + (" | ".join(last_lines(log)[-_TAIL_LINES:]) or "(it wrote nothing)")
 
 
 def _end_group(group: int, process: subprocess.Popen[bytes] | None = None) -> None:

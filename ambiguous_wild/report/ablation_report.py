@@ -28,9 +28,9 @@ from ambiguous_wild.harness.ablation_records import (
     VariantRow,
 )
 from ambiguous_wild.harness.measures import Measure, measure
-from ambiguous_wild.io.files import atomic_path, write_json, write_text
+from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.methods.ablation_groups import DEFAULT
-from ambiguous_wild.report.cost_plots import label_points, new_figure
+from ambiguous_wild.report.cost_plots import label_points, new_figure, save_as
 from ambiguous_wild.report.plain_formats import to_csv, to_markdown
 from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableCell, ranks
 
@@ -101,8 +101,7 @@ def draw(data: StudyReport, path: Path) -> bool:
     for panel, (group, points) in zip(axes, groups):
         key, at = _swept([row for row in data["rows"] if row["group"] == group["name"]])
         _panel(panel, group, _over_values(data, group["name"], at) if key else points, key)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, metadata={"Software": None})
+    save_as(figure, path)
     return True
 
 

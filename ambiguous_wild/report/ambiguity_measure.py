@@ -15,10 +15,11 @@ from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.harness.sheets import evenly_spaced
 from ambiguous_wild.io.images import load_image_float, read_gray
 from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
+from ambiguous_wild.io.scene_folder import without_suffix
 from ambiguous_wild.methods.refinesplat.structure import GREY, correlation
 from ambiguous_wild.metrics import ambiguity as am
 from ambiguous_wild.metrics import semantic as sem
-from ambiguous_wild.report.ambiguity_sources import Background, DistractorMasks, load_mask, stem
+from ambiguous_wild.report.ambiguity_sources import Background, DistractorMasks, load_mask
 from ambiguous_wild.vision.motion_maps import MOVES, moving_map
 
 KINDS = ("colour", "structure", "features", "motion")
@@ -252,7 +253,7 @@ def _instances(scene: Scene, masks: DistractorMasks, view: View, hidden: np.ndar
     """Label the distractors of a mask [h, w] bool: by numbers of a simulated capture, else by connection."""
     from scipy import ndimage
 
-    path = scene.root / "truth" / "instances" / f"{stem(view)}.png"
+    path = scene.root / "truth" / "instances" / f"{without_suffix(view.name)}.png"
     if masks.source != "truth" or not path.is_file():
         return np.asarray(ndimage.label(hidden)[0])
     size = hidden.shape[1], hidden.shape[0]
@@ -307,9 +308,8 @@ def _size(features: str, shape: tuple[int, ...]) -> tuple[int, int] | None:
 def _object_masks(folder: Path, views: list[View]) -> dict[str, Path]:
     if not folder.is_dir():
         raise AwError(f"there is no folder {folder} of object masks (--objects)")
-    masks = {v.name: path for v in views if (path := folder / f"{stem(v)}.png").is_file()}
+    masks = {v.name: path for v in views if (path := folder / f"{without_suffix(v.name)}.png").is_file()}
     if not masks:
-        raise AwError(
-            f"{folder} holds no mask of a train photo: name them as the photos, {stem(views[0])}.png"
-        )
+        like = f"{without_suffix(views[0].name)}.png"
+        raise AwError(f"{folder} holds no mask of a train photo: name them as the photos, {like}")
     return masks

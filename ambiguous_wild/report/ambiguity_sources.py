@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from ambiguous_wild.harness.result_file import MODEL
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.images import load_image_float, read_mask
 from ambiguous_wild.io.ply import read_splat_ply
+from ambiguous_wild.io.scene_folder import without_suffix
 from ambiguous_wild.viewing.model import gaussians_of
 
 # limits for a background that a run renders
@@ -88,7 +89,7 @@ def _all(scene: Scene, folder: Path, advice: str) -> dict[str, Path]:
         raise AwError(
             f"there is no mask folder {folder} for {scene.name}: give --distractor-masks truth|scene|run|DIR"
         )
-    return _complete({v.name: folder / f"{stem(v)}.png" for v in scene.train}, folder, advice)
+    return _complete({v.name: folder / f"{without_suffix(v.name)}.png" for v in scene.train}, folder, advice)
 
 
 def _complete(paths: Mapping[str, Path | None], folder: Path, advice: str) -> dict[str, Path]:
@@ -141,7 +142,7 @@ def clean_background(index: int, view: View, *, folder: Path) -> Seen:
     Raises:
         AwError: the clean version differs from the photo in size.
     """
-    path = folder / f"{stem(view)}.png"
+    path = folder / f"{without_suffix(view.name)}.png"
     if not path.is_file():
         return None, None
     image = load_image_float(path)
@@ -213,7 +214,7 @@ def find_background(scene: Scene, choice: str | None, run: Path | None, masks: D
         AwError: there is neither, or not the chosen one.
     """
     clean = scene.root / "truth" / "clean"
-    has_clean = any((clean / f"{stem(v)}.png").is_file() for v in scene.train)
+    has_clean = any((clean / f"{without_suffix(v.name)}.png").is_file() for v in scene.train)
     if choice is None:
         choice = "clean" if has_clean else "run" if run is not None else ""
     if choice == "clean" and has_clean:
@@ -228,11 +229,6 @@ def find_background(scene: Scene, choice: str | None, run: Path | None, masks: D
         f"{scene.name} has no clean versions in {clean}: the background of its distractors is unknown; give "
         "--run RUN of a trained run, or --background none to leave colour out"
     )
-
-
-def stem(view: View) -> str:
-    """Return the photo's name without its suffix, which is also the name of its mask."""
-    return str(PurePosixPath(view.name).with_suffix(""))
 
 
 def check_run(scene: Scene, run: Path) -> None:

@@ -55,7 +55,7 @@ def guard(text: str) -> str:
 
 def unguard(cell: str) -> str:
     """Return the text that `guard` was given."""
-    return cell[1:] if cell.startswith("'") else cell
+    return cell.removeprefix("'")
 
 
 def number(value: float | None) -> str:

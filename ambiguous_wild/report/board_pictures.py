@@ -18,7 +18,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.harness.result_file import render_path
 from ambiguous_wild.harness.trained_models import MASKS
-from ambiguous_wild.io.files import atomic_path, sha256_file, write_text
+from ambiguous_wild.io.files import sha256_file, write_bytes, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import jpeg_bytes
 from ambiguous_wild.report.board import (
@@ -170,8 +170,7 @@ class BoardPictures:
         """Write a picture and its row; the index is not written."""
         path = self.folder / subject.file
         if not path.is_file() or path.read_bytes() != data:
-            with atomic_path(path) as temporary:
-                temporary.write_bytes(data)
+            write_bytes(path, [data])
         numbers = {
             "seed": "" if seed is None else str(seed),
             "psnr": "" if math.isnan(psnr) else repr(float(psnr)),

@@ -305,9 +305,8 @@ def publish(
     check_output(out)
     out = Path(os.path.realpath(out))
     with folder_lock(out, "aw leaderboard publish"):
-        _restore(out)
+        sweep_siblings(out)  # puts the old page back if a call was killed while it replaced it
         _check_folder(out)
-        sweep_siblings(out)
         entries, index = read_board(board), board_pictures.read_index(board)
         shown = shown_names(labels, [e.method for e in entries])
         named = [replace(e, method=shown[e.method]) for e in entries]
@@ -332,16 +331,6 @@ def publish(
         reported_from=None if source is None else str(source),
         model_pages=pages,
     )
-
-
-def _restore(out: Path) -> None:
-    """Put the old page back if a call was killed between moving it away and moving the new one in."""
-    if out.exists():
-        return
-    for left in sorted(out.parent.glob(f".{out.name}.old-*")):
-        if (left / out.name / "index.html").is_file():
-            os.replace(left / out.name, out)
-            return
 
 
 def _check_folder(out: Path) -> None:

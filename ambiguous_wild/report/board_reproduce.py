@@ -35,7 +35,7 @@ SIMULATED = "simulated"
 EXACT_POSES = ", exact poses"  # ends the name of a dataset whose poses are not estimated
 
 
-def setting(config: RunConfig, planned: bool = False) -> str:
+def setting(config: RunConfig, planned: bool) -> str:
     """Return length, effects, protocol and limits as text: "2000 iterations, effects exposure".
 
     Where each scene's plan chose the effects (`planned`), they differ by scene and are called "auto".
@@ -96,7 +96,7 @@ def command(config: RunConfig, before: Sequence[str] = (), recorded: str = "") -
     return text
 
 
-def command_words(config: RunConfig, recorded: str = "") -> list[str]:
+def command_words(config: RunConfig, recorded: str) -> list[str]:
     """Return the words of the command, "aw", "bench", then options with a value each, unchecked."""
     train = config["train"]
     words: list[object] = ["aw", "bench", *_method(config, recorded)]

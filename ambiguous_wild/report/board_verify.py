@@ -228,7 +228,7 @@ def _check_files(run: Path, result: RunResult, *, ours: bool) -> dict[str, Path]
     renders = renders_of(run, result)
     lacking += [str(path.relative_to(run)) for path in renders.values() if not path.is_file()]
     if lacking:
-        raise AwError(f"{run} is partial, it lacks {shortlist(lacking)}; {RESTORE}")
+        _partial(run, f"it lacks {shortlist(lacking)}")
     if not renders:
         raise AwError(f"{run} measured no test image: a board takes only scenes with test views")
     unlisted = sorted({p.name for p in set((run / RENDERS).rglob("*.png")) - set(renders.values())})
@@ -371,19 +371,13 @@ def _compare(run: Path, row: ImageRow, metric: Metric, computed: Mapping[str, fl
     """Check one metric of one image against the computed value; a run may lack a metric as a whole."""
     key, name, values = metric.key, row["name"], metrics_of(row)
     if key in values and key not in computed:
-        raise AwError(
-            f"{run} was changed: metrics.json has {key} of {name}, but that picture has no such pixel; "
-            f"{RESTORE}"
-        )
+        _changed(run, f"{RESULT} has {key} of {name}, but that picture has no such pixel")
     if key in computed and key not in values:
         why = "although the picture has such pixels" if metric.partial else "but of the other images"
-        raise AwError(f"{run} is partial: it has no {key} of {name}, {why}; {RESTORE}")
+        _partial(run, f"it has no {key} of {name}, {why}")
     if key not in values:
         return
     value, correct = _or_nan(values[key]), _or_nan(computed[key])
     both_missing = math.isnan(value) and math.isnan(correct)
     if not (value == correct or abs(value - correct) <= (metric.tolerance or 0.0) or both_missing):
-        raise AwError(
-            f"{run} was changed: {key} of {name} is {value:.6f} in metrics.json, render and photo give "
-            f"{correct:.6f}; {RESTORE}"
-        )
+        _changed(run, f"{key} of {name} is {value:.6f} in {RESULT}, render and photo give {correct:.6f}")

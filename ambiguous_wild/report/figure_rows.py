@@ -7,6 +7,7 @@ is better does not enter.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,8 +67,7 @@ class RunsFigure:
     @property
     def group_sizes(self) -> dict[tuple[str, bool], int]:
         """The number of rows of renders, and of masks, of each scene."""
-        groups = [(row.scene, row.masks) for row in self.rows]
-        return {group: groups.count(group) for group in groups}
+        return Counter((row.scene, row.masks) for row in self.rows)
 
 
 @dataclass(frozen=True)

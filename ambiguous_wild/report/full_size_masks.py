@@ -21,6 +21,7 @@ from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.screen import read_capture, without_copies
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.core.machine import photo_threads
 from ambiguous_wild.core.names import spelling_key
 from ambiguous_wild.harness.store import run_folders
@@ -39,6 +40,7 @@ from ambiguous_wild.io.lens import Lens, make_lens
 from ambiguous_wild.io.mask_files import MASK_FOLDERS, MASK_STYLES, OWN_STYLE, MaskStyle, mask_names
 from ambiguous_wild.io.original_photos import AGAIN, OriginalPhoto, capture_folder, is_built, original_photos
 from ambiguous_wild.io.photos import is_photo, read_photo
+from ambiguous_wild.io.scene_folder import without_suffix
 from ambiguous_wild.report.inpainting import Inpainting
 
 RADIUS = 3.0  # of the filter, in pixels of the mask
@@ -73,9 +75,7 @@ class FullSizeMasks:
             (self.unread, "no mask of"),
             (self.left_out, "not inpainted:"),
         ):
-            reasons: dict[str, list[str]] = {}
-            for photo, why in photos.items():
-                reasons.setdefault(why, []).append(photo)
+            reasons = grouped(photos, photos.__getitem__)
             lines += [f"{what} {shortlist(names)}: {why}" for why, names in reasons.items()]
         return lines
 
@@ -343,10 +343,10 @@ def _photos_of(scene: Scene) -> _CapturePhotos:
         folder = f"images_{scene.info['loaded_factor']}"
     files = (path for path in sorted((scene.root / folder).rglob("*")) if path.is_file() and is_photo(path))
     by_name = {path.relative_to(scene.root / folder).as_posix(): path for path in files}
-    by_stem = {str(PurePosixPath(name).with_suffix("")): path for name, path in by_name.items()}
+    by_stem = {without_suffix(name): path for name, path in by_name.items()}
     inside = []
     for view in scene.views:  # at another factor the file may have another suffix
-        path = by_name.get(view.name) or by_stem.get(str(PurePosixPath(view.name).with_suffix("")))
+        path = by_name.get(view.name) or by_stem.get(without_suffix(view.name))
         if path is None:
             raise AwError(f"{scene.root / folder} has no photo {view.name}: restore it")
         name = path.relative_to(scene.root / folder).as_posix()

@@ -7,13 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.datasets.foreign import plain
 from ambiguous_wild.harness.store import Runs, check_names
 from ambiguous_wild.report.audit_numbers import MEAN, REPORTED, PrintedNumber, read_tables
 from ambiguous_wild.report.comparison import comparison, quality_columns
 from ambiguous_wild.report.pairs import Ties
 from ambiguous_wild.report.table_layout import BLANK, Column, Row, Table, TableCell
 
-PER_TABLE = 6  # scenes side by side, as in the papers
+PER_TABLE = 6  # scenes side by side, as in the papers; more are several tables, the last with the mean
 FAMILIES = ("psnr", "ssim", "lpips")
 NAMES = {"model_mb": "memory"}  # key of a measure -> its name in papers
 
@@ -30,7 +31,6 @@ def paper(
     metrics: Sequence[str] = (),
     scenes: Sequence[str] = (),
     datasets: Mapping[str, Sequence[str]] | None = None,
-    per_table: int = PER_TABLE,
 ) -> list[Table]:
     """Return tables with scenes side by side, PSNR / SSIM / LPIPS under each, and the mean last.
 
@@ -39,7 +39,6 @@ def paper(
         metrics: columns under each scene; empty = PSNR, SSIM and the LPIPS that was measured.
         scenes: names of scenes to show; empty = all.
         datasets: scenes by dataset. Each dataset has its own tables and mean; other scenes come last.
-        per_table: most scenes of a table; more are divided into several tables, with the mean in the last.
 
     Raises:
         AwError: unknown metric, scene, or a scene in two datasets.
@@ -48,7 +47,7 @@ def paper(
     for name, members, tables in _by_dataset(runs, metrics, scenes, datasets or {}):
         by_scene, mean = (tables[1:], tables[:1]) if len(members) > 1 else (tables, [])
         title = name or (f"{len(members)} scenes" if mean else tables[0].title)
-        chunks = [by_scene[i : i + per_table] for i in range(0, len(by_scene), per_table)]
+        chunks = [by_scene[i : i + PER_TABLE] for i in range(0, len(by_scene), PER_TABLE)]
         for number, chunk in enumerate(chunks, start=1):
             part = f" ({number} of {len(chunks)})" if len(chunks) > 1 else ""
             shown = [(table.title, table) for table in chunk]
@@ -166,11 +165,11 @@ def read_reported(folder: Path | None = None) -> list[PrintedNumber]:
 
 def datasets_of(numbers: Sequence[PrintedNumber], scenes: Sequence[str]) -> dict[str, list[str]]:
     """Group our scenes by the dataset in which a reported table has a scene of the same name."""
-    dataset_of = {_normalised(n.scene): n.dataset for n in numbers if n.known}
+    dataset_of = {plain(n.scene): n.dataset for n in numbers if n.known}
     datasets: dict[str, list[str]] = {}
     for scene in scenes:
-        if _normalised(scene) in dataset_of:
-            datasets.setdefault(dataset_of[_normalised(scene)], []).append(scene)
+        if plain(scene) in dataset_of:
+            datasets.setdefault(dataset_of[plain(scene)], []).append(scene)
     return datasets
 
 
@@ -187,7 +186,7 @@ def with_reported(table: Table, numbers: Sequence[PrintedNumber]) -> Table:
     texts: dict[tuple[str, str, str], dict[str, list[str]]] = {}  # (method, scene, metric) -> by dataset
     for n in numbers:
         if n.known and not n.setting:
-            by_dataset = texts.setdefault((n.method, _normalised(n.scene), n.metric), {})
+            by_dataset = texts.setdefault((n.method, plain(n.scene), n.metric), {})
             by_dataset.setdefault(n.dataset, []).append(n.text)
     rows = []
     for method in dict.fromkeys(key[0] for key in texts):
@@ -204,14 +203,9 @@ def _cell(
 ) -> TableCell:
     family = column.measure.key.partition("_")[0]
     metric = NAMES.get(column.measure.key, family if family in FAMILIES else "")
-    by_dataset = texts.get((method, _normalised(column.scene or MEAN), metric), {})
+    by_dataset = texts.get((method, plain(column.scene or MEAN), metric), {})
     if column.dataset:
         values = by_dataset.get(column.dataset, [])
     else:  # the name identifies a scene without its dataset, but not a mean
         values = [text for of in by_dataset.values() for text in of] if column.scene else []
     return TableCell(printed=" / ".join(dict.fromkeys(values))) if values else BLANK
-
-
-def _normalised(name: str) -> str:
-    """Return a scene's name in lower case with letters and digits only, as its spelling varies."""
-    return "".join(c for c in name.casefold() if c.isalnum())

@@ -329,7 +329,7 @@ def _importance(column: Measure, first: Sequence[str]) -> int:
     return first.index(column.key) if column.key in first else len(first)
 
 
-def divided(table: Table, width: int = WIDTH) -> list[Table]:
+def divided(table: Table, width: int) -> list[Table]:
     """Divide the table into tables that fit; columns with one heading stay together if possible."""
     room = width - max(map(display_width, [table.head, *map(row_name, table.rows)]))
     parts: list[list[int]] = [[]]

@@ -126,9 +126,7 @@ def _grid(runs: Sequence[_Run]) -> list[str]:
         sentences.append(f"Masks given as files, with the SHA-256 of all in a folder: {_listed(masks)}.")
     if corrected := [run for run in runs if run.config and run.config.get("corrections")]:
         sentences.append(f"Masks of {_which(corrected, runs)} were corrected by hand.")
-    effects = _said(
-        runs, lambda run: effects_of(run.result["facts"]), "{}", "{}",
-    )  # fmt: skip
+    effects = _said(runs, lambda run: effects_of(run.result["facts"]), "{}", "{}")
     if effects != "none":
         sentences.append(f"Effects learnt beside the Gaussians: {effects}.")
     return sentences

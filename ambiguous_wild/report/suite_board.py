@@ -162,7 +162,9 @@ def _of_board(
         method = MethodScores(name + (f" {options}" if several else "") + BOARD, ranked=not knows_truth(name))
         for entry in of:
             method.scenes.setdefault(entry.scene, {})[entry.seed] = {
-                key: value for key, value in entry.quality.items() if key == "psnr" or _has_masks(entry)
+                key: value
+                for key, value in entry.quality.items()
+                if key == "psnr" or "mask_recall" in entry.quality
             }
         lacking = [scene for scene in scenes if method.scenes.get(scene, {}).keys() != seeds]
         if lacking:
@@ -177,10 +179,6 @@ def _of_board(
             "another version; differences include those of the scenes"
         )
     return methods, notes
-
-
-def _has_masks(entry: Entry) -> bool:
-    return "mask_recall" in entry.quality
 
 
 def _factor(entry: Entry) -> int | None:

@@ -13,7 +13,7 @@ from typing import Any, Final, TypedDict
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.core.names import is_text
+from ambiguous_wild.core.names import is_text, quoted
 
 KEY_FORMAT, KEY_VERSION = "aw-study-key", 1
 KIND_PHOTO: Final = "ambiguity"
@@ -201,14 +201,14 @@ def _read(path: Path, key: Key) -> Rater:
     data = _json(path, text) if text.lstrip()[:1] in ("{", "[") else _csv(path, text)
     if data["study"] != key.study:
         raise AwError(
-            f"{path} answers study {_short(data['study'])}, but the key is of study {key.study}: the page is "
+            f"{path} answers study {quoted(data['study'])}, but the key is of study {key.study}: the page is "
             "another one or was made again; give the key of its page"
         )
     rater, name = data["rater"], data["name"]
     if isinstance(rater, str):
         rater = rater.strip()  # ignore blanks, so that a copy is recognised
     if not isinstance(rater, str) or not rater.strip() or len(rater) > LONGEST or not isinstance(name, str):
-        raise _edited(path, f"has no valid rater ({_short(rater)})")
+        raise _edited(path, f"has no valid rater ({quoted(rater)})")
     if not is_text(rater) or not is_text(name):
         raise _edited(path, "has half a character in its rater or name")
     answers = tuple(_answer(path, row, key) for row in data["answers"])
@@ -245,7 +245,7 @@ def _json(path: Path, text: str) -> AnswerFile:
         raise AwError(f"{path} is no answer file of a study page; leave it out")
     if data.get("version") != VERSION:
         raise AwError(
-            f"{path} has version {_short(data.get('version'))}, this program reads {VERSION}; update it"
+            f"{path} has version {quoted(data.get('version'))}, this program reads {VERSION}; update it"
         )
     study, rater, name = (data.get(k, "") for k in ("study", "rater", "name"))
     return {"study": study, "rater": rater, "name": name, "answers": data["answers"]}
@@ -274,33 +274,28 @@ def _csv(path: Path, text: str) -> AnswerFile:
 
 def _answer(path: Path, row: Any, key: Key) -> Answer:
     if not isinstance(row, dict):
-        raise AwError(f"{path} is malformed: {_short(row)} is no answer")
+        raise AwError(f"{path} is malformed: {quoted(row)} is no answer")
     question, answer = row.get("question"), row.get("answer")
     entry = key.questions.get(question) if isinstance(question, str) else None
     if entry is None:
-        raise AwError(f"{path} answers a question that is not in the study: {_short(question)}")
+        raise AwError(f"{path} answers a question that is not in the study: {quoted(question)}")
     choices = CHOICES[entry["kind"]]
     if not isinstance(answer, str) or answer not in choices:
-        raise AwError(f"{path} answers {_short(answer)} to {question}; allowed: {', '.join(choices)}")
+        raise AwError(f"{path} answers {quoted(answer)} to {question}; allowed: {', '.join(choices)}")
     left = row.get("left") or ""
     if left not in (("x", "y") if entry["kind"] == KIND_PAIR else ("",)):
-        raise _edited(path, f"has {_short(left)} as the left image of {question}")
+        raise _edited(path, f"has {quoted(left)} as the left image of {question}")
     try:
         seconds = -1.0 if isinstance(row.get("ms"), bool) else float(row.get("ms")) / 1000  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         seconds = -1.0
     if not 0 <= seconds < 1e7:
-        raise AwError(f"{path} has no valid time for {question} ({_short(row.get('ms'))}): it was edited")
+        raise AwError(f"{path} has no valid time for {question} ({quoted(row.get('ms'))}): it was edited")
     shown = row.get("outline")
     if not isinstance(shown, (str, bool, type(None))) or shown not in OUTLINES:
-        raise _edited(path, f"has {_short(shown)} as outline of {question}")
+        raise _edited(path, f"has {quoted(shown)} as outline of {question}")
     return Answer(str(question), answer, left, seconds, seconds < TOO_FAST_S[entry["kind"]], OUTLINES[shown])
 
 
 def _edited(path: Path, what: str) -> AwError:
     return AwError(f"{path} {what}: it was edited; ask the rater to save again")
-
-
-def _short(value: Any) -> str:
-    text = ascii(value)
-    return text if len(text) <= 40 else text[:37] + "..."

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TypedDict
 
 import cv2
@@ -16,6 +16,7 @@ import pandas as pd
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.errors import shortlist
+from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.result_file import RENDERS, RESULT, check_render, read_result
 from ambiguous_wild.harness.store import check_names, read_runs
@@ -24,7 +25,7 @@ from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import data_uri, fill_page, jpeg_bytes, narrowed
 from ambiguous_wild.io.progress_bar import Progress
-from ambiguous_wild.io.scene_folder import load_scene
+from ambiguous_wild.io.scene_folder import load_scene, without_suffix
 from ambiguous_wild.report.notes import unequal
 from ambiguous_wild.report.plain_formats import UNEQUAL
 from ambiguous_wild.study.answers import KEY_FORMAT, KEY_VERSION, KIND_PAIR, KIND_PHOTO, study_id
@@ -74,7 +75,7 @@ def scene_photos(folder: Path, *, outline: bool = True) -> list[PhotoQuestion]:
     scene = load_scene(folder)
     questions = []
     for view in scene.train:
-        mask = scene.root / "truth" / "distractor" / f"{_stem(view.name)}.png"
+        mask = scene.root / "truth" / "distractor" / f"{without_suffix(view.name)}.png"
         has_mask = mask.is_file()
         if has_mask and not (read_gray(mask) >= 128).any():
             continue
@@ -165,7 +166,7 @@ def _renders(run: Path) -> dict[str, Path]:
     result, folder = read_result(run / RESULT), run / RENDERS
     for name in result.get("render_sha256", {}):
         check_render(run, result, name)
-    return {_stem(p.relative_to(folder).as_posix()): p for p in sorted(folder.rglob("*.png"))}
+    return {without_suffix(p.relative_to(folder).as_posix()): p for p in sorted(folder.rglob("*.png"))}
 
 
 def _test_photos(run: Path) -> dict[str, Path]:
@@ -173,14 +174,12 @@ def _test_photos(run: Path) -> dict[str, Path]:
         scene = open_scene(run)
     except AwError as error:
         raise AwError(f"{error}; --no-truth leaves the photos out") from None
-    return {_stem(v.name): v.image_path for v in scene.test}
+    return {without_suffix(v.name): v.image_path for v in scene.test}
 
 
 def sample_questions(questions: Sequence[Question], limit: int, rng: np.random.Generator) -> list[Question]:
     """Choose at most `limit` questions, spread evenly over their groups, in random order."""
-    groups: dict[str, list[Question]] = {}
-    for question in questions:
-        groups.setdefault(question.group, []).append(question)
+    groups = grouped(questions, lambda question: question.group)
     for members in groups.values():
         rng.shuffle(members)
     names = sorted(groups)
@@ -189,10 +188,6 @@ def sample_questions(questions: Sequence[Question], limit: int, rng: np.random.G
     while len(chosen) < limit and any(groups.values()):
         chosen += [groups[n].pop() for n in names if groups[n]][: limit - len(chosen)]
     return [chosen[i] for i in rng.permutation(len(chosen))]
-
-
-def _stem(name: str) -> str:
-    return str(PurePosixPath(name).with_suffix(""))
 
 
 def outlined(photo: Path, mask: Path) -> np.ndarray:  # [H, W, 3] uint8
@@ -276,7 +271,8 @@ def make_study(
         answers[token] = entry
     # the id depends on the images: the same questions on other renders are another study
     identity = study_id(settings.title, asked, answers, album.hashes)
-    text = page_html({"study": identity, "title": settings.title, "questions": asked, "images": album.images})
+    data = {"study": identity, "title": settings.title, "questions": asked, "images": album.images}
+    text = fill_page(Path(__file__).parent, data, ("page.js",))
     write_text(page, text)  # before the key, so that there is no key without a page
     write_json(
         key,
@@ -353,11 +349,3 @@ def _pair(
     entry = {"kind": KIND_PAIR, "scene": question.scene, "view": question.view,
              "x": question.methods[order[0]], "y": question.methods[order[1]]}  # fmt: skip
     return images, entry
-
-
-def page_html(data: Mapping[str, object]) -> str:
-    """Return the HTML page with its data, escaped so that it cannot end its script element.
-
-    `data`: study, title, the questions, and the data URI of each image by its token.
-    """
-    return fill_page(Path(__file__).parent, data, ("page.js",))

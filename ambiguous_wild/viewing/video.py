@@ -190,9 +190,8 @@ def _smooth(keys: Sequence[Camera], frames: int, size: tuple[int, int]) -> list[
     centers = CubicSpline(at, to_world[:, :3, 3])(wanted)
     rotations = RotationSpline(at, turns)(wanted).as_matrix()
     # A lens changes monotonically between keys, so it cannot overshoot below zero.
-    lenses = np.array([fitted(key, size, key.cam_from_world) for key in keys], dtype=object)
-    values = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses])
-    values = PchipInterpolator(at, values)(wanted)
+    lenses = (fitted(key, size, key.cam_from_world) for key in keys)
+    values = PchipInterpolator(at, [[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses])(wanted)
     return [
         Camera(size[0], size[1], fx, fy, cx, cy, pose_at(center, rotation.T))
         for center, rotation, (fx, fy, cx, cy) in zip(centers, rotations, values)
@@ -331,14 +330,12 @@ def write_gif(path: Path, frames: Sequence[Frame], fps: float) -> None:
     """Write frames atomically as a repeating animation with one palette for all frames.
 
     Raises:
-        AwError: no frame, or Pillow is missing.
+        AwError: no frame.
     """
     if not frames:
         raise AwError(f"cannot write {path}: no frame")
-    try:
-        from PIL import Image
-    except ImportError:
-        raise AwError(f"cannot write {path}: Pillow is missing: python -m pip install pillow") from None
+    from PIL import Image
+
     sample = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 8)]))
     palette = sample.quantize(_GIF_COLOURS, method=Image.Quantize.MEDIANCUT)
     pictures = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]

@@ -42,12 +42,3 @@ def test_several_lengths_and_effects_have_folders_of_their_own(tmp_path: Path) -
     assert cell_folder(Path("o"), alone) == Path("o/scene/3dgs/seed0")
     assert alone.identity == cells[0].identity  # where a run lies is not what it is
     assert grouped({"none": planned["none"]}) == planned["none"]
-
-
-def test_files_of_the_user_under_a_report_s_names_stay(tmp_path: Path) -> None:
-    cost_run(tmp_path / "runs", "a", psnr=(20.0,), train_s=300.0, probes=[(100.0, 15.0), (200.0, 19.0)])
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "changes.csv").write_text("mine")
-    done = aw("cost", tmp_path / "runs", "-o", tmp_path / "out")
-    assert done.returncode == 2 and "changes.csv exists" in done.stderr
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["changes.csv"]

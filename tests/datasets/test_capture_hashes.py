@@ -83,7 +83,7 @@ def test_every_change_of_a_capture_changes_its_hash(what: str, made: Path, captu
     assert capture_hash(capture) != capture_hash(made)
 
 
-def test_the_size_of_an_image_counts(made: Path, capture: Path) -> None:
+def test_the_size_of_an_image_counts(capture: Path) -> None:
     """Of a mask of one value, the pixels alone would not tell."""
     mask = capture / "truth" / "distractor" / "IMG_0002.png"
     found = set()

@@ -221,7 +221,7 @@ def test_names_that_the_model_lacks_are_counted_and_said(tmp_path):
     assert "warning: 1 listed test photo not in the model: lost.png" in done.stdout
 
 
-def test_the_same_import_again_does_nothing_and_another_is_refused(imported, tmp_path):
+def test_the_same_import_again_does_nothing_and_another_is_refused(tmp_path):
     root = layouts.native(tmp_path / "raw")
     first = import_scene(root, tmp_path / "scene")
     state = (first.scene / "scene.json").stat().st_mtime_ns

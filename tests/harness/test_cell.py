@@ -209,7 +209,6 @@ options: {strength: 1}
 def test_a_method_given_by_reference_is_found_again_from_anywhere(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, setting: str
 ) -> None:
-    monkeypatch.setattr(registry, "registered", {})
     monkeypatch.setenv("AW_NERFBASELINES", "true")
     folder = tmp_path / "my@work"
     folder.mkdir()
@@ -224,10 +223,7 @@ def test_a_method_given_by_reference_is_found_again_from_anywhere(
     assert "--plugin" not in text
 
 
-def test_a_graft_names_the_plugin_of_its_host(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(registry, "registered", {})
+def test_a_graft_names_the_plugin_of_its_host(scene: Path, tmp_path: Path) -> None:
     plugin = tmp_path / "mine.py"
     plugin.write_text(f"{RECIPE}\nregister(MethodEntry('mine', 'of my own', build, config=Config))\n")
     load_plugin(plugin)
@@ -246,10 +242,7 @@ def test_a_variant_of_an_ablation_is_its_method_with_other_settings(scene: Path)
     assert typed(reproduce(variant)).identity == dataclasses.replace(cell, options=options).identity
 
 
-def test_budgets_and_plugins_are_part_of_the_command(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(registry, "registered", {})
+def test_budgets_and_plugins_are_part_of_the_command(scene: Path, tmp_path: Path) -> None:
     plugin = tmp_path / "mine.py"
     plugin.write_text(
         "from ambiguous_wild.methods import MethodEntry, register\n"

@@ -42,11 +42,6 @@ shutil.copy(photos[seed + 1], output / "1.png")
 """
 
 
-@pytest.fixture(autouse=True)
-def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
-
-
 @pytest.fixture(scope="module")
 def frail(tmp_path_factory):
     """A method's reference, and the file that says how often it kills its worker."""
@@ -138,7 +133,7 @@ def test_a_plugin_with_a_recipe_travels_as_a_method(tmp_path):
     assert (source.path, source.content) == (str(tmp_path / "own.py"), b"def mine(): ...\n")
 
 
-def test_a_cell_that_kills_every_process_is_a_failure(cell, tmp_path):
+def test_a_cell_that_kills_every_process_is_a_failure(cell):
     cell, job = cell
     killer = jobs.CodeSource(
         "killer.py", "plugin", "/nowhere/killer.py", b"import os; os.kill(os.getpid(), 9)"

@@ -40,11 +40,6 @@ BASE = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
-
-
 def describe(folder, **changes):
     path = folder / "nearest.yaml"
     path.write_text(yaml.safe_dump(BASE | changes))
@@ -305,7 +300,7 @@ def test_values_stay_within_their_argument(scene, tmp_path):
     assert not (tmp_path / "pwned").exists()
 
 
-def test_a_toml_file_says_the_same(scene, tmp_path):
+def test_a_toml_file_says_the_same(tmp_path):
     path = tmp_path / "nearest.toml"
     lines = [f"{key} = {json.dumps(BASE[key])}" for key in BASE if key != "scene_files"]
     path.write_text("\n".join([*lines, "[scene_files]", '"sparse/0/test.txt" = "{test_names}"']))

@@ -31,11 +31,6 @@ shutil.copyfile(splats, output / "splats.ply")
 """
 
 
-@pytest.fixture(autouse=True)
-def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
-
-
 @pytest.fixture(scope="module")
 def model(scene, tmp_path_factory):
     """A trained model of ours, and its file of splats."""

@@ -89,9 +89,7 @@ def test_a_second_one_ends_at_once(
     assert (run / "checkpoint" / "last.safetensors").is_file()
 
 
-def test_the_command_says_what_it_kept(
-    tmp_path: Path, scene: Path, ctrl_c: None, monkeypatch: pytest.MonkeyPatch, capsys
-) -> None:
+def test_the_command_says_what_it_kept(ctrl_c: None, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     def bench_that_is_stopped(*args: object, **kwargs: object) -> None:
         raise Stopped("stopped after 3 iterations of 9")
 

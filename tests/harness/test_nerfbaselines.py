@@ -56,11 +56,6 @@ elif words[0] == "evaluate":
 """
 
 
-@pytest.fixture(autouse=True)
-def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
-
-
 @pytest.fixture
 def calls(tmp_path, monkeypatch):
     """Installs the stand-in; returns a function that reads what it was called with."""

@@ -31,6 +31,7 @@ from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
 from ambiguous_wild.viewing.video import labelled
+from tests.splat.scenes import bits
 from tests.tiny_scene import HEIGHT, TRAIN, WIDTH
 
 ITERATIONS = 120
@@ -51,10 +52,6 @@ def trainer_for(scene, folder, parts=None) -> Trainer:
         parts = entry.build(options)
     data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
     return Trainer(data, parts, TrainConfig(iterations=ITERATIONS, probes=0), folder=folder)
-
-
-def bits(trainer):
-    return {name: tensor.numpy().tobytes() for name, tensor in trainer.gaussians.items()}
 
 
 @pytest.fixture(scope="module")

@@ -199,7 +199,7 @@ def test_the_numbers_are_what_was_put_in():
     assert measure(*synthetic(zoom=3.0)).sampling == pytest.approx(3.0 ** (0.9), rel=0.1)
 
 
-def test_a_scene_without_tracks_reads_no_photo_and_says_unknown(tmp_path):
+def test_a_scene_without_tracks_reads_no_photo_and_says_unknown():
     scene, _ = synthetic()
     empty = dataclasses.replace(scene.points, track_views=np.full_like(scene.points.track_views, -1))
     plan = plan_effects(dataclasses.replace(scene, points=empty))

@@ -18,7 +18,7 @@ from ambiguous_wild.harness.replay import open_run, replay
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.io.images import read_keep_map, read_png_rgb, write_png
 from ambiguous_wild.io.mask_reasons import read_reasons
-from ambiguous_wild.methods import MethodEntry, register, registry
+from ambiguous_wild.methods import MethodEntry, register
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.train_config import TrainConfig
@@ -31,8 +31,7 @@ class Poison(MaskPolicy):
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
+def run(tmp_path):
     register(MethodEntry("poison", "a NaN at iteration 9", lambda options: MethodHooks(mask=Poison())))
     scene = write_tiny_scene(tmp_path / "scene")
 

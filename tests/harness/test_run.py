@@ -19,7 +19,7 @@ from ambiguous_wild.harness.result_file import check_model, read_result
 from ambiguous_wild.io.files import folder_lock, sha256_file
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.ply import read_splat_ply
-from ambiguous_wild.methods import MethodEntry, register, registry
+from ambiguous_wild.methods import MethodEntry, register
 from ambiguous_wild.metrics.image import flip, psnr, psnr_affine
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.train_config import TrainConfig
@@ -45,8 +45,7 @@ def explode(options):
 
 
 @pytest.fixture(autouse=True)
-def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
+def _methods():
     register(MethodEntry("truth", "exact masks", lambda options: MethodHooks(mask=TruthMask())))
     register(MethodEntry("broken", "fails", explode))
 
@@ -246,7 +245,7 @@ def test_a_changed_file_is_named_and_trained_again_alone(scene, tmp_path):
         bench(scene, tmp_path / "runs", "3dgs", train=longer, overwrite="changed")
 
 
-def test_a_run_that_succeeds_after_a_failure_leaves_no_trace_of_it(scene, tmp_path, monkeypatch):
+def test_a_run_that_succeeds_after_a_failure_leaves_no_trace_of_it(scene, tmp_path):
     bench(scene, tmp_path, "broken")
     register(MethodEntry("broken", "mended", lambda options: MethodHooks()))
     (cell,), (report,) = bench(scene, tmp_path, "broken")
@@ -338,7 +337,7 @@ def test_a_run_folder_that_is_a_link_is_trained_where_it_leads(scene, tmp_path):
     assert (tmp_path / "runs/scene/3dgs/seed0").is_symlink()
 
 
-def test_photos_too_small_to_be_measured_are_said_before_training(scene, tmp_path):
+def test_photos_too_small_to_be_measured_are_said_before_training(tmp_path):
     small = write_tiny_scene(tmp_path / "small")
     for path in (small / "images").iterdir():
         cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (12, 9)))

@@ -94,7 +94,7 @@ def test_it_goes_on_in_either_pass_with_the_same_bits(scene, whole, tmp_path, mo
     assert (again.folder / name).read_bytes() == (whole.folder / name).read_bytes()
 
 
-def test_half_of_a_budget_is_each_passes(scene, tmp_path):
+def test_half_of_a_budget_is_each_passes():
     from types import SimpleNamespace
 
     from ambiguous_wild.splat.train_config import TrainConfig

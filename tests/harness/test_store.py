@@ -254,13 +254,6 @@ def test_a_single_run_folder_can_be_read(tmp_path: Path) -> None:
     assert len(read_runs(tmp_path / "yard" / "3dgs" / "seed0").runs) == 1
 
 
-def test_nothing_there_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(AwError, match="aw bench"):
-        read_runs(tmp_path)
-    with pytest.raises(AwError, match="no folder of runs"):
-        read_runs(tmp_path / "absent")
-
-
 def test_two_results_for_one_cell_are_refused(tmp_path: Path) -> None:
     write_result(tmp_path / "one" / "metrics.json", fake_result("3dgs"))
     write_result(tmp_path / "two" / "metrics.json", fake_result("3dgs"))

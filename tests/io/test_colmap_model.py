@@ -85,7 +85,7 @@ def test_an_absurd_count_is_refused_before_allocating(tmp_path, name):
         read_model(tmp_path)
 
 
-def test_lens_distortion_is_refused_for_training_with_the_command(tmp_path):
+def test_lens_distortion_is_refused_for_training_with_the_command():
     camera = make_model(["a.png"], camera="SIMPLE_RADIAL").cameras[7]
     with pytest.raises(AwError, match=r"SIMPLE_RADIAL.*aw import FOLDER"):
         camera.pinhole()

@@ -1,4 +1,4 @@
-"""What the tests of the baselines share: a trainer on the tiny scene, one step at hand, and its bits."""
+"""What the tests of the baselines share: a trainer on the tiny scene and one step at hand."""
 
 from __future__ import annotations
 
@@ -46,10 +46,6 @@ def trained(scene: Path, folder: Path, parts: MethodHooks, iterations: int = 120
     return trainer
 
 
-def bits(trainer: Trainer) -> dict[str, bytes]:
-    return {name: tensor.numpy().tobytes() for name, tensor in trainer.gaussians.items()}
-
-
 def step_of(
     data: TrainData, view: int, image: torch.Tensor, *, iteration: int = 1000, nominal: float = 10_000.0
 ) -> Step:
@@ -68,16 +64,6 @@ def step_of(
         rendered=rendered,  # type: ignore[arg-type]
         gaussians=None,  # type: ignore[arg-type]
     )
-
-
-def same(a: object, b: object) -> bool:
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
-        return len(a) == len(b) and all(map(same, a, b))
-    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
-        return torch.equal(a, b)
-    return bool(a == b)
 
 
 def masked_more_inside(trainer: Trainer) -> tuple[float, float]:

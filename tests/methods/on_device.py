@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.splat import backend
 from tests.methods.test_refinesplat_policy import (
     FAST,
@@ -51,12 +50,6 @@ def capture(folder) -> SimpleNamespace:
 LOOK = dataclasses.replace(FAST.first_look, least=0.0, threshold=0.1, normal=1.0, known_by=1)
 PLAIN = RefineSplatConfig(min_mask_start=1, mask_every=1, mask=MaskConfig(least=6.0), first_look=LOOK)
 MOST = 1e-3  # of a photo's pixels: what lies within rounding of the threshold, and what hangs on it
-
-
-def made(scene, config=PLAIN) -> RefineSplatMask:
-    policy = RefineSplatMask(config)
-    policy.setup(scene.data)
-    return policy
 
 
 def visit(scene, number: int):

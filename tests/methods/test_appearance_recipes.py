@@ -26,12 +26,7 @@ from ambiguous_wild.splat.effects.geometry import (
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.step import ViewContext
 from tests.methods.baselines import data_of, parts_of, step_of, trainer_of
-from tests.splat.scenes import camera, gaussians
-
-
-def random(*shape, seed=0):
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
-
+from tests.splat.scenes import camera, gaussians, random
 
 # -- what recipes share ---------------------------------------------------------------------------
 

@@ -2,7 +2,6 @@
 
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
@@ -11,7 +10,7 @@ from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.rendered import Cotangents, Frame
 from ambiguous_wild.splat.step import ViewContext
 from ambiguous_wild.splat.watchdog import NonFinite
-from tests.methods.baselines import data_of, parts_of, trained, trainer_of
+from tests.methods.baselines import data_of, masked_more_inside, parts_of, trained, trainer_of
 
 
 @pytest.fixture(scope="module")
@@ -117,13 +116,8 @@ def test_a_clear_layer_lets_a_white_background_through(scene, tmp_path):
 def test_layers_take_up_distractors(scene, tmp_path):
     """The red squares of the photos are covered more than the rest of them."""
     trainer = trained(scene, tmp_path, parts_of("desplat", points="200", min_start="0"), iterations=400)
-    inside, outside = [], []
-    for view in range(6):
-        keep = trainer.hooks.mask.predict(trainer.make_step(trainer.iteration, view)).numpy()
-        square = np.zeros(keep.shape, bool)
-        square[14:26, 14 + 4 * view : 26 + 4 * view] = True
-        inside.append(keep[square].mean()), outside.append(keep[~square].mean())
-    assert np.mean(inside) < np.mean(outside) - 0.15
+    inside, outside = masked_more_inside(trainer)
+    assert inside < outside - 0.15
 
 
 def test_a_layer_that_is_not_finite_is_found_before_a_checkpoint(scene, tmp_path):

@@ -11,8 +11,9 @@ from ambiguous_wild.splat.effects import effect_pipeline
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
-from tests.methods.baselines import parts_of, same, trainer_of
+from tests.methods.baselines import parts_of, trainer_of
 from tests.splat import fake_gsplat
+from tests.splat.scenes import same
 from tests.splat.test_whole_step import late
 from tests.tiny_scene import with_points
 

@@ -12,7 +12,7 @@ from ambiguous_wild.cli.table import table_command as table
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.grid import plan_cells
-from ambiguous_wild.methods import MethodEntry, get_method, register, registry
+from ambiguous_wild.methods import MethodEntry, get_method, register
 from ambiguous_wild.methods.given_masks import GraftedPolicy
 from ambiguous_wild.methods.graft import check_graft, compose, graft_name
 from ambiguous_wild.methods.refinesplat.density_control import EntropyAwareDensity
@@ -24,7 +24,8 @@ from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.colour import AffineExposure
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.train_config import TrainConfig
-from tests.methods.baselines import bits, parts_of, trained
+from tests.methods.baselines import parts_of, trained
+from tests.splat.scenes import bits
 
 TRUE_3DGS = "3dgs@mask=truth"
 
@@ -115,8 +116,7 @@ def test_settings_reach_host_and_donors_by_their_names(scene):
         plan_cells([name], [scene], [0], train, settings=["robustsplat.erosoin=5"])
 
 
-def test_a_donors_plugin_is_part_of_the_identity(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
+def test_a_donors_plugin_is_part_of_the_identity():
     hashes = []
     for source in ("a", "b"):
         register(MethodEntry("mine", "", "ambiguous_wild.methods.threedgs:build", source_hash=source))
@@ -129,9 +129,8 @@ def test_a_donors_plugin_is_part_of_the_identity(monkeypatch):
 
 
 @pytest.fixture
-def toned(monkeypatch):
+def toned():
     """A method whose recipe brings an effect of its own, an affine exposure per photo."""
-    monkeypatch.setattr(registry, "registered", {})
 
     class Toned(RobustSplatMask):
         def cotangent(self, step, keep):
@@ -177,8 +176,7 @@ def test_the_effects_of_a_donor_are_taken_where_they_are_asked_for(toned, recwar
     assert not recwarn.list
 
 
-def test_effects_that_are_taken_change_what_they_need_of_the_renderer(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
+def test_effects_that_are_taken_change_what_they_need_of_the_renderer():
     register(MethodEntry("filtered", "", lambda options: with_effects(MethodHooks(), ["antialias"])))
     assert not parts_of("3dgs").antialias
     parts = parts_of("3dgs@effects=filtered")
@@ -316,8 +314,7 @@ def test_other_programs_neither_take_nor_give_parts(name):
         get_method(name)
 
 
-def test_other_programs_are_known_by_their_names_too(monkeypatch, tmp_path):
-    monkeypatch.setattr(registry, "registered", {})
+def test_other_programs_are_known_by_their_names_too(tmp_path):
     get_method("external:opensplat")
     with pytest.raises(AwError, match="opensplat is trained by another program, which takes no parts"):
         get_method("opensplat@density=uad")

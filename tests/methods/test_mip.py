@@ -21,8 +21,8 @@ from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
 from ambiguous_wild.splat.rendered import GSPLAT_SUMS, check_needs
-from tests.methods.baselines import bits, data_of, parts_of, trained, trainer_of
-from tests.splat.scenes import camera, gaussians
+from tests.methods.baselines import data_of, parts_of, trained, trainer_of
+from tests.splat.scenes import bits, camera, gaussians
 
 
 def test_both_filters_reach_the_renderer(scene, tmp_path):

@@ -10,10 +10,11 @@ import torch
 from ambiguous_wild.methods import dronesplat, masking_common, robustsplat
 from ambiguous_wild.methods.masking_common import MaskNet, adam_of, adam_state, enlarged, load_adam_state
 from ambiguous_wild.methods.robustsplat import RobustSplatConfig
-from ambiguous_wild.splat import backend, checkpoint
+from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.step import Step
-from tests.host_reads import READ, moved, no_transfers
-from tests.methods.baselines import data_of, parts_of, same, step_of
+from tests.host_reads import READ, moved, no_transfers, on_accelerator
+from tests.methods.baselines import data_of, parts_of, step_of
+from tests.splat.scenes import same
 from tests.tiny_scene import TRAIN
 
 STEPS = 8
@@ -37,10 +38,6 @@ def drawn(monkeypatch):
 
     monkeypatch.setattr(Step, "draw", draw)
     return cameras
-
-
-def on_accelerator(monkeypatch, yes=True):
-    monkeypatch.setattr(backend, "accelerated", lambda _: yes)
 
 
 def renders(data, steps=STEPS):

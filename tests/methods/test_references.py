@@ -47,11 +47,6 @@ number = 3
 '''
 
 
-@pytest.fixture(autouse=True)
-def _methods(monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
-
-
 @pytest.fixture
 def recipe(tmp_path):
     (tmp_path / "recipe.py").write_text(CODE)

@@ -21,10 +21,10 @@ from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig
 from ambiguous_wild.splat import gpu_kernels
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.optim import SplatAdam
-from tests.methods.on_device import LOOK, MOST, PLAIN, capture, differing, made, noise, on, tensor, visit
+from tests.methods.on_device import LOOK, MOST, PLAIN, capture, differing, noise, on, tensor, visit
 from tests.methods.test_refinesplat_pixels import asked, others_of, store
 from tests.methods.test_refinesplat_pixels import camera as side_camera
-from tests.methods.test_refinesplat_policy import FAST, HEIGHT, VIEWS, WIDTH
+from tests.methods.test_refinesplat_policy import FAST, HEIGHT, VIEWS, WIDTH, fresh, plain
 from tests.splat import scenes
 
 
@@ -241,7 +241,7 @@ NO_OTHERS = dataclasses.replace(PLAIN.mask, multiview=MultiViewConfig(strength=0
     ids=["default", "no memory", "nobody asked"],
 )
 def test_masks_over_visits_are_the_cpus(scene, monkeypatch, config):
-    cpu, there = made(scene, config), made(scene, config)
+    cpu, there = fresh(scene, config), fresh(scene, config)
     changed = 0
     for number in range(3 * VIEWS):
         step = visit(scene, number)
@@ -264,7 +264,7 @@ def test_masks_over_visits_are_the_cpus(scene, monkeypatch, config):
 
 @pytest.mark.parametrize("begins_there", [True, False])
 def test_a_run_goes_on_on_the_other_machine(scene, monkeypatch, begins_there):
-    begun, resumed = made(scene), made(scene)
+    begun, resumed = fresh(scene, PLAIN), fresh(scene, PLAIN)
     on(monkeypatch, begins_there)
     for number in range(VIEWS + 2):
         begun.keep(visit(scene, number))
@@ -281,17 +281,9 @@ def test_a_run_goes_on_on_the_other_machine(scene, monkeypatch, begins_there):
         assert differing(expected, resumed.keep(step)) <= MOST
 
 
-def plain(value):
-    if isinstance(value, torch.Tensor):
-        return str(value.dtype), value.tolist()
-    if isinstance(value, dict):
-        return {key: plain(v) for key, v in sorted(value.items())}
-    return value
-
-
 @pytest.mark.parametrize(("statistic", "shown"), [("structure", "evidence"), ("entropy", "entropy")])
 def test_pictures_are_drawn_of_what_the_device_holds(scene, accelerated, tmp_path, statistic, shown):
-    policy = made(
+    policy = fresh(
         scene,
         dataclasses.replace(PLAIN, psi=FAST.psi, mask=dataclasses.replace(PLAIN.mask, statistic=statistic)),
     )

@@ -31,6 +31,7 @@ from tests.methods.test_refinesplat_policy import (
     background,
     blurred,
     distracted,
+    fresh,
     make_data,
     step_of,
 )
@@ -50,12 +51,6 @@ def scene(tmp_path_factory):
     return SimpleNamespace(
         clean=clean, data=make_data(tmp_path_factory.mktemp("scene"), list(photos), list(truths))
     )
-
-
-def policy_of(scene, config: RefineSplatConfig) -> RefineSplatMask:
-    policy = RefineSplatMask(config)
-    policy.setup(scene.data)
-    return policy
 
 
 def cells_of(grid: np.ndarray) -> np.ndarray:
@@ -103,7 +98,7 @@ def by_the_formulas(policy: RefineSplatMask, view: int, image: torch.Tensor, w2:
 @pytest.mark.parametrize("w2", [0.3, 0.8])
 def test_masks_equal_the_formulas(scene, config, w2):
     config = dataclasses.replace(config, mask=dataclasses.replace(config.mask, w2=w2, most=1.0))
-    policy = policy_of(scene, config)
+    policy = fresh(scene, config)
     image = blurred(scene.clean[1], 1)
     local, global_, final = by_the_formulas(policy, 1, image, w2, isinstance(config, PrintedConfig))
     _, masks = policy.masks.examine(step_of(scene.data, 1, image))
@@ -113,18 +108,18 @@ def test_masks_equal_the_formulas(scene, config, w2):
 
 
 def test_printed_masks_everything_but_one_instance_or_no_instance(scene):
-    policy = policy_of(scene, PRINTED)
+    policy = fresh(scene, PRINTED)
     _, first = policy.masks.examine(step_of(scene.data, 0, blurred(scene.clean[0], 0)))
     flagged = np.unique(policy.inputs.labels[0][first.local])
     assert len(flagged) == policy.inputs.counts[0] - 1  # w2 starts at 1/2: the first of equal objectives
     high = dataclasses.replace(PRINTED, mask=dataclasses.replace(PRINTED.mask, w2=0.6))
-    _, last = policy_of(scene, high).masks.examine(step_of(scene.data, 0, blurred(scene.clean[0], 0)))
+    _, last = fresh(scene, high).masks.examine(step_of(scene.data, 0, blurred(scene.clean[0], 0)))
     assert not last.local.any()
 
 
 @BOTH
 def test_the_entropy_terms_weigh_cells_as_they_are_defined(scene, config):
-    policy = policy_of(scene, config)
+    policy = fresh(scene, config)
     image = blurred(scene.clean[0], 0)
     step = step_of(scene.data, 0, image)
     keep = torch.ones(HEIGHT, WIDTH)
@@ -150,13 +145,13 @@ def test_the_entropy_terms_are_no_longer_than_their_limit(scene):
     keep = torch.ones(HEIGHT, WIDTH)
     keep[:, : WIDTH // 2] = 0.0
     config = dataclasses.replace(PAPER, entropy_every=3)
-    free = policy_of(scene, dataclasses.replace(config, entropy_limit=0.0)).cotangent(step, keep)
+    free = fresh(scene, dataclasses.replace(config, entropy_limit=0.0)).cotangent(step, keep)
     length = float(photometric(step.rendered.image, step.photo, keep).d_image.norm())
     assert float(free.norm()) / 3 > 0.1 * length  # the limit below does something
-    short = policy_of(scene, dataclasses.replace(config, entropy_limit=0.1)).cotangent(step, keep)
+    short = fresh(scene, dataclasses.replace(config, entropy_limit=0.1)).cotangent(step, keep)
     assert float(short.norm()) / 3 == pytest.approx(0.1 * length, rel=1e-5)
     assert torch.allclose(short / short.norm(), free / free.norm(), atol=1e-6)
-    wide = policy_of(scene, dataclasses.replace(config, entropy_limit=1e9)).cotangent(step, keep)
+    wide = fresh(scene, dataclasses.replace(config, entropy_limit=1e9)).cotangent(step, keep)
     assert torch.equal(wide, free)  # never lengthened
 
 
@@ -164,7 +159,7 @@ def test_unweighted_losses_leave_out_what_the_capture_masks(scene):
     own = torch.ones(HEIGHT, WIDTH)
     own[:, : WIDTH // 2] = 0.0
     data = dataclasses.replace(scene.data, user_keep=[own] * VIEWS)
-    policy = policy_of(SimpleNamespace(data=data), PRINTED)
+    policy = fresh(SimpleNamespace(data=data), PRINTED)
     step = step_of(data, 0, blurred(scene.clean[0], 0))
     gradient = policy.cotangent(step, torch.zeros(HEIGHT, WIDTH))
     assert float(gradient[:, WIDTH // 2 + 8 :].abs().sum()) > 0
@@ -174,8 +169,8 @@ def test_unweighted_losses_leave_out_what_the_capture_masks(scene):
 def test_the_printed_factor_trains_on_what_is_masked(scene):
     mask = dataclasses.replace(PAPER.mask, w2=0.5)
     step = step_of(scene.data, 0, blurred(scene.clean[0], 0))
-    keep = policy_of(scene, dataclasses.replace(PAPER, mask=mask)).keep(step)
-    other = policy_of(scene, dataclasses.replace(PAPER, mask=mask, factor="transient")).keep(step)
+    keep = fresh(scene, dataclasses.replace(PAPER, mask=mask)).keep(step)
+    other = fresh(scene, dataclasses.replace(PAPER, mask=mask, factor="transient")).keep(step)
     assert 0.0 < float(keep.mean()) < 1.0
     assert torch.equal(keep + other, torch.ones(HEIGHT, WIDTH))
 

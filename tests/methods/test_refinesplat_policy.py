@@ -256,14 +256,15 @@ def test_predict_changes_nothing(scene, config):
     assert to_bytes(policy) == before
 
 
-def to_bytes(policy: RefineSplatMask) -> str:
-    def plain(value):
-        if isinstance(value, torch.Tensor):
-            return (str(value.dtype), value.tolist())
-        if isinstance(value, dict):
-            return {k: plain(v) for k, v in sorted(value.items())}
-        return value
+def plain(value):
+    if isinstance(value, torch.Tensor):
+        return str(value.dtype), value.tolist()
+    if isinstance(value, dict):
+        return {key: plain(v) for key, v in sorted(value.items())}
+    return value
 
+
+def to_bytes(policy: RefineSplatMask) -> str:
     return repr(plain(policy.state_dict()))
 
 
@@ -311,7 +312,7 @@ def test_identities_scale_the_evidence_of_pixels(scene):
     assert np.median(ratio[truth]) > 1.0 > np.median(ratio[~scene.truths[0]])
 
 
-def test_ids_of_a_whole_scene_are_identities(scene, tmp_path):
+def test_ids_of_a_whole_scene_are_identities(scene):
     class Follower:
         name = "follower"
 

@@ -18,11 +18,7 @@ from ambiguous_wild.splat.gaussians import SH_C0
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.render import render
 from tests.methods.baselines import data_of, masked_more_inside, parts_of, step_of, trained, trainer_of
-from tests.splat.scenes import camera, gaussians
-
-
-def random(*shape, seed=0):
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+from tests.splat.scenes import camera, gaussians, random
 
 
 def slope(function, values, at, small=1e-3):

@@ -14,7 +14,8 @@ from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
 from ambiguous_wild.methods.truth import TruthConfig, TruthMask, clean_data, keep_outside
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from tests.methods.baselines import bits, data_of, parts_of, step_of, trained
+from tests.methods.baselines import data_of, parts_of, step_of, trained
+from tests.splat.scenes import bits
 from tests.tiny_scene import TRAIN, write_tiny_scene
 
 

@@ -311,8 +311,6 @@ def test_only_an_earlier_report_is_taken_away(tmp_path: Path) -> None:
 
 
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(AwError, match="no folder of runs"):
-        read(tmp_path / "absent")
     with pytest.raises(AwError, match="no run in"):
         read(tmp_path)
     save(tmp_path / "z", failed("b"))

@@ -126,7 +126,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "ssim": (lambda r: change_image(r, ssim=lambda v: v + 0.001), "was changed: ssim of test_0.png"),
     "value gone": (lambda r: change_image(r, 1, psnr=None), "no psnr of test_1.png"),
     "render": (repaint, "was changed: psnr of test_0.png"),
-    "render gone": (lambda r: (r / "renders/test/test_0.png").unlink(), "is partial, it lacks renders"),
+    "render gone": (lambda r: (r / "renders/test/test_0.png").unlink(), "is partial: it lacks renders"),
     "image unlisted": (lambda r: change_result(r, lambda d: d["per_image"].pop()), "test_1.png was rendered"),
     "image dropped": (drop_image, "is partial: 1 images were measured"),
     "render damaged": (lambda r: (r / "renders/test/test_0.png").write_bytes(b"x"), "test_0.png"),

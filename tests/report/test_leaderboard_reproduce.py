@@ -106,7 +106,6 @@ def test_an_own_method_is_named_as_it_was_given(
         "register(MethodEntry('plugged', '', lambda options: MethodHooks()))\n"
     )
     Path("own.yaml").write_text("{name: other, train: aw, render: aw, renders: '{output}/{stem}.png'}")
-    monkeypatch.setattr(registry, "registered", {})
     registry.load_plugin(Path("own.py"))
     (cell,) = plan_cells([given], [write_tiny_scene(tmp_path / "scene")], [0], TrainConfig(iterations=5))
     line = command(cell.config, (), reproduce(cell))

@@ -189,7 +189,6 @@ def test_the_report_of_an_ablation_says_it_too(tmp_path):
     assert "features labhog, instances graph" in markdown_of(data)
 
 
-def test_a_note_of_a_plugin_may_hold_options(tmp_path, monkeypatch):
-    monkeypatch.setattr(registry, "registered", {})
+def test_a_note_of_a_plugin_may_hold_options(tmp_path):
     register(MethodEntry("mine", "", "m:f", note="of size {size}"))
     assert "mine: of size 3" in notes_of(tmp_path, ("mine", {"size": 3}))

@@ -184,7 +184,7 @@ def test_a_hand_that_looks_too_far_away_is_refused_before_memory_is_asked_for(tm
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_walk_into_a_wall_is_refused(tmp_path: Path) -> None:
+def test_a_walk_into_a_wall_is_refused() -> None:
     with pytest.raises(AwError, match="lead the camera into a wall"):
         plan(parse_spec("radius_m: [7, 7]\narc_deg: 150\ndetail_px_per_m: 5"), 0)
 

@@ -9,6 +9,7 @@ from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.step import ViewContext
 from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
@@ -24,11 +25,19 @@ def camera(width=37, height=29, *, angle=0.3, fx=30.0, fy=33.0, cx=None, cy=None
     return Camera(width, height, fx, fy, cx, cy, pose)
 
 
+def shot_of(view: int | None, at: Camera | None = None) -> ViewContext:
+    return ViewContext(iteration=0, nominal=0.0, view=view, camera=camera() if at is None else at)
+
+
 def disturbed(camera: Camera, rotation, shift) -> np.ndarray:
     """The camera's pose [4, 4] followed by a turn (rotation vector, rad) and a shift, both in camera axes."""
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = Rotation.from_rotvec(rotation).as_matrix(), shift
     return motion @ camera.cam_from_world
+
+
+def random(*shape, seed=0):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
 
 
 def gaussians(seed=0, n=60, *, rest=15, size=-1.5) -> Gaussians:
@@ -82,3 +91,13 @@ def trained(scene, folder, **kw) -> Trainer:
 
 def bits(trainer: Trainer) -> dict[str, bytes]:
     return {name: tensor.numpy().tobytes() for name, tensor in trainer.gaussians.items()}
+
+
+def same(a: object, b: object) -> bool:
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
+        return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+        return torch.equal(a, b)
+    return bool(a == b)

@@ -18,10 +18,10 @@ from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import START_SHARE, MethodHooks
 from ambiguous_wild.splat.reference import render_reference
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
-from ambiguous_wild.splat.step import TrainData, ViewContext
+from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
-from tests.splat.scenes import bits, disturbed
+from tests.splat.scenes import bits, disturbed, shot_of
 from tests.splat.scenes import camera as make_camera
 from tests.splat.scenes import gaussians as random_gaussians
 from tests.splat.scenes import trainer_for as trainer_of
@@ -208,12 +208,6 @@ def test_exposure_gradients_and_closure():
     effect.adam.values[1] = row
     effect.step(found.effect_grads["exposure"], shot_of(1))
     assert effect.adam.values[:3].sum(dim=0).abs().max() < 1e-12
-
-
-def shot_of(view, camera=None) -> ViewContext:
-    return ViewContext(
-        iteration=0, nominal=0.0, view=view, camera=make_camera() if camera is None else camera
-    )
 
 
 def as_gradients(g, weights) -> Gradients:

@@ -8,7 +8,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ambiguous_wild.core import Scene, SparsePoints, View
-from ambiguous_wild.splat import backend
 from ambiguous_wild.splat.data import shrink_camera
 from ambiguous_wild.splat.effects import ALL, with_effects
 from ambiguous_wild.splat.effects.base import RowAdam
@@ -19,16 +18,12 @@ from ambiguous_wild.splat.effects.smoothing import filter_sizes
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import NOTHING, Gradients, as_cotangents
 from ambiguous_wild.splat.step import TrainData, ViewContext
-from tests.host_reads import READ, moved
+from tests.host_reads import READ, moved, on_accelerator
 from tests.splat.scenes import camera as make_camera
 from tests.splat.scenes import disturbed
 from tests.splat.scenes import gaussians as random_gaussians
 
 SIZE = 24, 18
-
-
-def on_accelerator(monkeypatch, yes=True):
-    monkeypatch.setattr(backend, "accelerated", lambda _: yes)
 
 
 def data_of(views=3):

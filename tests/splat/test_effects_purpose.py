@@ -11,9 +11,8 @@ from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.tracks import photo_gains
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.step import ViewContext
 from ambiguous_wild.splat.training_loop import train
-from tests.splat.scenes import bits, disturbed, trainer_for
+from tests.splat.scenes import bits, disturbed, shot_of, trainer_for
 from tests.splat.scenes import camera as make_camera
 from tests.tiny_scene import write_tiny_scene
 
@@ -21,12 +20,6 @@ from tests.tiny_scene import write_tiny_scene
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     return load_scene(write_tiny_scene(tmp_path_factory.mktemp("data") / "scene", distractors=False))
-
-
-def shot_of(view, camera=None) -> ViewContext:
-    return ViewContext(
-        iteration=0, nominal=0.0, view=view, camera=make_camera() if camera is None else camera
-    )
 
 
 def brightened(data, gains):

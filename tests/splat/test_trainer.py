@@ -27,7 +27,7 @@ from ambiguous_wild.splat.pace import Level, Pace, ceiling_at, coarse_to_fine, f
 from ambiguous_wild.splat.rendered import Cotangents
 from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.training_loop import train
-from tests.splat.scenes import bits, trained, trainer_for
+from tests.splat.scenes import bits, same, trained, trainer_for
 from tests.tiny_scene import write_tiny_scene
 
 
@@ -109,14 +109,6 @@ def test_kill_in_mid_training_then_again_gives_the_same_checkpoint(scene, tmp_pa
     )
     for part in ("gaussians", "optimiser", "density"):
         assert same(whole[part], killed[part]), part
-
-
-def same(a, b) -> bool:
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, list):
-        return len(a) == len(b) and all(map(same, a, b))
-    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
 
 
 class FakeTime:

@@ -1,11 +1,7 @@
 """One capture that holds every defect: each file is used or refused by itself; and one of two photos."""
 
-import struct
-import zlib
-
 import cv2
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 
 from ambiguous_wild.builder.collect import collect
@@ -16,6 +12,7 @@ from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import image_size, load_image_float, read_gray, read_png_rgb
 from tests.builder.capture_maker import write_capture
+from tests.io.photo_maker import announce, save
 
 LONG = "x" * 240 + ".jpg"
 
@@ -23,25 +20,6 @@ LONG = "x" * 240 + ".jpg"
 def picture(seed, width=96, height=72, channels=3):
     small = np.random.default_rng(seed).integers(0, 256, (9, 12, channels), dtype=np.uint8)
     return cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC).reshape(height, width, channels)
-
-
-def save(path, pixels, fmt="uint8", **attributes):
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], fmt)
-    for name, value in attributes.items():
-        spec.attribute(name.replace("__", ":"), value)
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec), output.geterror()
-    assert output.write_image(np.ascontiguousarray(pixels)), output.geterror()
-    output.close()
-    return path
-
-
-def with_size(data, width, height):
-    """The PNG with another size in its header, its checksum mended."""
-    data = bytearray(data)
-    data[16:24] = struct.pack(">II", width, height)
-    data[29:33] = struct.pack(">I", zlib.crc32(bytes(data[12:29])))
-    return bytes(data)
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +42,7 @@ def raw(tmp_path_factory):
     (raw / "cut.jpg").write_bytes(whole[: len(whole) // 2])
     (raw / "empty.jpg").write_bytes(b"")
     save(raw / "pixel.png", picture(13, 1, 1))
-    data = save(raw / "huge.png", picture(14)).read_bytes()
-    (raw / "huge.png").write_bytes(with_size(data, 20000, 10000))
+    announce(save(raw / "huge.png", picture(14)), 20000, 10000)
     try:
         from PIL import Image
 

@@ -220,7 +220,7 @@ def test_a_notebook_shows_the_page_in_a_frame(runs: Path) -> None:
     assert "3dgs" in repr(viewer)
 
 
-def test_a_stranger_s_method_name_imports_no_file(runs: Path, tmp_path: Path) -> None:
+def test_a_stranger_s_method_name_imports_no_file(tmp_path: Path) -> None:
     (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\ndef recipe(options): ...\n")
     config = {"method": f"{tmp_path / 'evil.py'}:recipe", "options": {}}
     look, note = read_render_settings(config)
@@ -441,7 +441,7 @@ def image_of(uri: str) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",", 1)[1]), np.uint8), cv2.IMREAD_UNCHANGED)
 
 
-def test_runs_with_masks_of_a_folder_are_drawn_as_their_method(tmp_path: Path) -> None:
+def test_runs_with_masks_of_a_folder_are_drawn_as_their_method() -> None:
     config = {
         "method": "mip-splatting@mask=sam",
         "source": "hash of the masks",

@@ -57,12 +57,12 @@ def which_model(root: Path, chosen: str = "") -> str:
     return several_models(models, folder) if folder is not None and models else ""
 
 
-def read_named_model(root: Path, chosen: str = "") -> tuple[ColmapModel, Path]:
+def read_named_model(root: Path, chosen: str) -> tuple[ColmapModel, Path]:
     """Read the model and find the folder of its photos, whose paths in it become their names.
 
     Args:
         root: the dataset's folder.
-        chosen: name of one of several models.
+        chosen: name of one of several models, or "".
 
     Raises:
         AwError: no model, a damaged one, or a name that no list can hold.

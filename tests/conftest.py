@@ -89,9 +89,9 @@ def pytest_collection_modifyitems(config, items):
     wanted = [item for item in items if item.get_closest_marker("gpu")]
     if not wanted:
         return
-    from ambiguous_wild.splat.readiness import look, why_not
+    from ambiguous_wild.splat.readiness import gpu_facts, missing_dependency
 
-    lack = why_not(look())
+    lack = missing_dependency(gpu_facts())
     if lack is not None:
         skip = pytest.mark.skip(reason=f"no GPU to test on: {lack.what}")
         for item in wanted:

@@ -83,7 +83,7 @@ def environment(device: str) -> Environment:
     if revision := commit():
         facts["commit"] = revision
     if device.startswith("cuda"):
-        from ambiguous_wild.splat.gsplat_seam import max_alpha
+        from ambiguous_wild.splat.gsplat_calls import max_alpha
 
         facts["gpu"] = torch.cuda.get_device_name(device)
         facts["gsplat_max_alpha"] = max_alpha(device)  # differs between its sources

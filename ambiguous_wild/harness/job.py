@@ -116,7 +116,7 @@ def run_job(job: Job) -> CellReport:
         if cell.method.program is None and cell.device == "cpu":
             prepare_cpu(job.threads)
         elif cell.method.program is None:
-            readiness.require(readiness.look())
+            readiness.require_gpu(readiness.gpu_facts())
         with patient_lock(folder, "aw bench", LOCK_WAIT_S):
             pass
     except Exception as error:

@@ -25,7 +25,7 @@ from ambiguous_wild.core.config import State
 from ambiguous_wild.core.machine import allowed_cores
 from ambiguous_wild.harness.result_file import Cost, TimeRecord
 from ambiguous_wild.harness.timing import Verdict, in_reference_seconds
-from ambiguous_wild.splat.calibration import KERNELS, Reading, calibration
+from ambiguous_wild.splat.calibration import KERNELS, CalibrationResult, calibration
 
 _STAT = Path("/proc/stat")
 _IDLE = (3, 4)  # fields of a line of /proc/stat: idle, waiting for a disk
@@ -151,7 +151,7 @@ class Meter:
         device: str,
         threads: int,
         *,
-        read: Callable[[], Reading] | None = None,
+        read: Callable[[], CalibrationResult] | None = None,
         presence: ActiveRuns | None = None,
     ) -> None:
         """

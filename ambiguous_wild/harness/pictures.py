@@ -139,7 +139,9 @@ def draw_density(trainer: Trainer, path: Path) -> list[Path]:
 def _counts(axes: Any, trainer: Trainer) -> None:
     rounds, rows = trainer.density.log.rounds, trainer.timeline.rows
     steps = np.array([0] + [r["iteration"] for r in rows] + [r.iteration for r in rounds])
-    count = np.array([trainer.pace.start] + [r["gaussians"] for r in rows] + [r.count for r in rounds])
+    count = np.array(
+        [trainer.run_schedule.start] + [r["gaussians"] for r in rows] + [r.count for r in rounds]
+    )
     order = np.argsort(steps, kind="stable")
     axes.plot(steps[order], count[order], color="k", lw=1.5)
     merges = [r for r in rounds if r.merged]

@@ -60,9 +60,9 @@ class Session:
             return device
         if device == "cpu":
             return device
-        from ambiguous_wild.splat.readiness import choose
+        from ambiguous_wild.splat.readiness import choose_device
 
-        return choose(device, self.callbacks.say)
+        return choose_device(device, self.callbacks.say)
 
     def in_process(self, cells: Sequence[Cell]) -> bool:
         """Return whether cells run in this process one by one; otherwise `run` starts other processes.

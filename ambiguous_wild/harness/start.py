@@ -80,12 +80,12 @@ def started(hooks: MethodHooks, start: StartFile | None, scene: Scene) -> Method
 
 def start_line(start: StartFile, method: str, hooks: MethodHooks, train: TrainConfig, scene: Scene) -> str:
     """Return a line that says how many splats or points of the file a run starts from."""
-    from ambiguous_wild.splat.method_hooks import thinned
-    from ambiguous_wild.splat.pace import cap
+    from ambiguous_wild.splat.method_hooks import start_rows
+    from ambiguous_wild.splat.run_schedule import max_gaussians
 
     sizes = [(view.camera.height, view.camera.width) for view in scene.train]
-    most = cap(train, hooks.schedule, sizes, hooks.density_config.max_gaussians)
-    kept = len(thinned(start.count, most))
+    most = max_gaussians(train, hooks.schedule, sizes, hooks.density_config.max_gaussians)
+    kept = len(start_rows(start.count, most))
     thin = (
         f", chosen at random: it may have {most:,} Gaussians (--max-gaussians)" if kept < start.count else ""
     )

@@ -27,7 +27,7 @@ from ambiguous_wild.methods.dronesplat import label_means
 from ambiguous_wild.methods.masking_common import EffectMask, d_keep, resized
 from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansConfig
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import AutogradEffect, Leaf, mlp_leaves
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.geometry import SceneNormaliser, conv_leaves, frequencies
 from ambiguous_wild.splat.field import Rates
@@ -64,7 +64,7 @@ class ForestSplatsConfig:
         check_limits(self, "forestsplats", filled=(0, 1), **limits)
 
 
-class Nets(Learnt):
+class Nets(AutogradEffect):
     """Holds the deforming net and the mask net. As an effect it changes no picture itself."""
 
     name = "forestsplats"

@@ -27,7 +27,13 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.masking_common import EffectMask, d_keep, hashed_uniform
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import (
+    AutogradEffect,
+    Leaf,
+    VisibleGaussians,
+    mlp,
+    mlp_leaves,
+)
 from ambiguous_wild.splat.effects.geometry import (
     SceneNormaliser,
     conv_leaves,
@@ -132,7 +138,7 @@ def build(options: GswConfig) -> MethodHooks:
     )  # fmt: skip
 
 
-class GswAppearance(Learnt):
+class GswAppearance(AutogradEffect):
     """Colours Gaussians by net(position, intrinsic feature, samples of three maps, direction)."""
 
     name, reads_photo = "gs-w", True
@@ -174,7 +180,7 @@ class GswAppearance(Learnt):
             "gsw_box": GaussianAttribute(torch.ones(len(means), 2, device=means.device), box, box / 100),
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo, means = self._seen(context), visible.means.detach()
         intrinsic = visible.attributes["gsw_intrinsic"]
         maps = self._mean_maps(context, leaf) if photo is None else maps_of(photo, leaf, self.config.side)

@@ -22,7 +22,7 @@ from torch import Tensor
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.masking_common import CountingMask, EffectMask, MaskedShares
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt
+from ambiguous_wild.splat.effects.autograd_effect import AutogradEffect, Leaf
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
@@ -54,7 +54,7 @@ def build(options: HybridGsConfig) -> MethodHooks:
     return MethodHooks(mask=PlaneMask(plane), density_config=options.density, effects=(plane,))
 
 
-class Plane(Learnt):
+class Plane(AutogradEffect):
     """Draws clip(T + (1 - M) S) from `joint` on, with T and M sums of the photo's 2D Gaussians."""
 
     name = "hybridgs"

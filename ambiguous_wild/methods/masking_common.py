@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.splat.effects.autograd_effect import Learnt
+from ambiguous_wild.splat.effects.autograd_effect import AutogradEffect
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.method_hooks import MaskPolicy
 from ambiguous_wild.splat.step import Step, TrainData
@@ -163,9 +163,9 @@ class PausingMask(WarmUpMask):
 class EffectMask(MaskPolicy):
     """A mask policy that reads an effect, which the run must have."""
 
-    effect: Learnt
+    effect: AutogradEffect
 
-    def required_effect(self) -> Learnt:
+    def required_effect(self) -> AutogradEffect:
         return self.effect
 
     def setup(self, data: TrainData) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.splat.density import DensityConfig, DensityControl, shaped
+from ambiguous_wild.splat.density import DensityConfig, DensityControl, covariance_offsets
 from ambiguous_wild.splat.gaussians import Gaussians, rotation_matrices
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.optim import SplatAdam
@@ -120,7 +120,7 @@ class McmcDensity(DensityControl):
         if not self.config.apart:
             return torch.zeros_like(g.means)
         noise = torch.from_numpy(self.rng.standard_normal((len(g), 3), dtype=np.float32)).to(g.device)
-        return self.config.apart * shaped(noise, g)
+        return self.config.apart * covariance_offsets(noise, g)
 
     def _draw(self, g: Gaussians, optimiser: SplatAdam, among: Tensor, count: int) -> Tensor:
         """Draw rows [count] by opacity; their opacity and scale become those of the copies."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.absgs import AbsoluteSums
-from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
+from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, top_k_mask
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes, widened
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
@@ -76,7 +76,7 @@ class AbsoluteMipDensity(AbsoluteSums, MipDensity):
         share = float(growing.float().mean())
         limit = matched(absolute, share)
         score = torch.maximum(signed / max(self.config.grow_grad, 1e-12), absolute / max(limit, 1e-12))
-        chosen = largest(score, growing | (absolute >= limit), self.room(step, gaussians))
+        chosen = top_k_mask(score, growing | (absolute >= limit), self.room(step, gaussians))
         return Growth.of(chosen, small)
 
 

@@ -35,7 +35,13 @@ from ambiguous_wild.methods.masking_common import (
 from ambiguous_wild.methods.wildgaussians import FeatureDistance, noisy_fourier
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import (
+    AutogradEffect,
+    Leaf,
+    VisibleGaussians,
+    mlp,
+    mlp_leaves,
+)
 from ambiguous_wild.splat.effects.geometry import directions, in_picture
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
@@ -90,7 +96,7 @@ def build(options: NexusSplatsConfig) -> MethodHooks:
     return MethodHooks(DrawnUncertainty(codes), control, options.density, effects=(codes,))
 
 
-class Codes(Learnt):
+class Codes(AutogradEffect):
     """The codes of photos and Gaussians, and both nets."""
 
     name = "nexussplats"
@@ -126,7 +132,7 @@ class Codes(Learnt):
             "nexus_uncertainty": GaussianAttribute(uncertainty, self.config.lr_code),
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo = leaf["light"].expand(len(visible.base), CODE)
         towards = directions(visible.means.detach(), context.camera)
         inputs = torch.cat([visible.base, visible.attributes["nexus_light"], photo, towards], dim=1)

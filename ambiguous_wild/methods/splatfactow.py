@@ -22,7 +22,13 @@ from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.masking_common import EffectMask, enlarged
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import (
+    AutogradEffect,
+    Leaf,
+    VisibleGaussians,
+    mlp,
+    mlp_leaves,
+)
 from ambiguous_wild.splat.effects.geometry import directions, harmonics, ray_directions
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -73,7 +79,7 @@ def build(options: SplatfactoWConfig) -> MethodHooks:
     )  # fmt: skip
 
 
-class SplatfactoColours(Learnt):
+class SplatfactoColours(AutogradEffect):
     """Draws SH = net([embedding; feature]), and picture + (1 - alpha) background(direction, embedding)."""
 
     name, unseen = "splatfacto-w", "mean"
@@ -111,7 +117,7 @@ class SplatfactoColours(Learnt):
             )
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo = leaf["photo"].expand(len(visible.means), PHOTO)
         feature = visible.attributes["splatfacto_feature"]
         hidden = F.relu(mlp(torch.cat([photo, feature], dim=1), leaf, "net"))

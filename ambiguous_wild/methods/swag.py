@@ -24,7 +24,13 @@ from ambiguous_wild.methods.masking_common import hashed_uniform
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import (
+    AutogradEffect,
+    Leaf,
+    VisibleGaussians,
+    mlp,
+    mlp_leaves,
+)
 from ambiguous_wild.splat.effects.geometry import SceneNormaliser, in_picture, mean_of_seen, with_penalty
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
@@ -173,7 +179,7 @@ def build(options: SwagConfig) -> MethodHooks:
     return MethodHooks(effects=(GatedColours(options),), density_config=options.density)
 
 
-class GatedColours(Learnt):
+class GatedColours(AutogradEffect):
     """Draws colour + 2 sigmoid(net) - 1, and opacity (1 - z), where z = 1 switches a Gaussian off."""
 
     name = "swag"
@@ -213,7 +219,7 @@ class GatedColours(Learnt):
         photo = leaf["photo"].expand(len(places), PHOTO)
         return mlp(torch.cat([places, photo, colours], dim=1), leaf, "net")
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         outputs = self._net(self.encoded(visible.means, leaf), visible.base, leaf)
         return visible.base + 2.0 * torch.sigmoid(outputs[:, :3]) - 1.0
 

@@ -38,7 +38,13 @@ from ambiguous_wild.methods.masking_common import (
     load_learner,
     resized,
 )
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import (
+    AutogradEffect,
+    Leaf,
+    VisibleGaussians,
+    mlp,
+    mlp_leaves,
+)
 from ambiguous_wild.splat.effects.base import rate_for_run_length
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -123,7 +129,7 @@ def build(options: WildGaussiansConfig) -> MethodHooks:
     return MethodHooks(mask=Uncertainty(options) if options.masks else MaskPolicy(), effects=effects)
 
 
-class WildAppearance(Learnt):
+class WildAppearance(AutogradEffect):
     """Draws (1 + m) colour + o, with (o, m) = scale MLP(colour, g of the Gaussian, a of the photo)."""
 
     name = "wildgaussians"
@@ -145,7 +151,7 @@ class WildAppearance(Learnt):
         start = noisy_fourier(gaussians.means, self.points, [self.seed, 0x36])
         return {"wild_embedding": GaussianAttribute(start, self.config.lr_gaussian)}
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo = leaf["photo"].expand(len(visible.base), PHOTO)
         inputs = torch.cat([visible.base, visible.attributes["wild_embedding"], photo], dim=1)
         offset, gain = (self.config.scale * mlp(inputs, leaf, "net")).split(3, dim=1)

@@ -249,7 +249,7 @@ class MethodHooks:
             AwError: fewer than 4 points.
         """
         if isinstance(self.given, Gaussians):
-            rows = torch.from_numpy(thinned(len(self.given), most))
+            rows = torch.from_numpy(start_rows(len(self.given), most))
             return self.given.select(rows).of_degree(self.sh_degree).to(data.device)
         if self.start is not None and self.given is None:
             return self.start(data)
@@ -259,7 +259,7 @@ class MethodHooks:
             LOG.debug("%d of %d sparse points left out: in the free space of photos", out.sum(), len(out))
         else:
             xyz, rgb = self.given
-        kept = thinned(len(xyz), most)
+        kept = start_rows(len(xyz), most)
         xyz, rgb = xyz[kept], rgb[kept]
         for points in self.more_points if len(xyz) >= MIN_POINTS else ():  # fewer are refused below
             room = int(START_SHARE * most) - len(xyz)
@@ -317,7 +317,7 @@ def check_cotangents(value: object, step: Step) -> None:
         )
 
 
-def thinned(count: int, most: int) -> np.ndarray:
+def start_rows(count: int, most: int) -> np.ndarray:
     """Return the rows of `count` points that a run of at most `most` Gaussians starts from; 0 = all."""
     if not most or count <= most:
         return np.arange(count)

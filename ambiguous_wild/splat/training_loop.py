@@ -116,7 +116,7 @@ def advance(trainer: Trainer, tick: Tick | None = None) -> None:
 def _marks(trainer: Trainer) -> tuple[int, int]:
     """Return how many probes and timeline rows are due since the start of the run."""
     now = (trainer.iteration, trainer.clock.now())
-    return trainer.pace.marks(trainer.config.probes, *now), trainer.pace.marks(ROWS, *now)
+    return trainer.run_schedule.marks(trainer.config.probes, *now), trainer.run_schedule.marks(ROWS, *now)
 
 
 def _save_if_finite(trainer: Trainer) -> bool:
@@ -143,7 +143,7 @@ def _roll_back(trainer: Trainer, error: NonFinite) -> None:
     spent, rollbacks = trainer.clock, list(watchdog.rollbacks)
     trainer.resume()
     trainer.clock = spent
-    epoch = trainer.pace.epoch(error.finding.iteration)
+    epoch = trainer.run_schedule.epoch(error.finding.iteration)
     watchdog.note_rollback(error, rollbacks, epoch=epoch, iteration=trainer.iteration)
     trainer.save()
 

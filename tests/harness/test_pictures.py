@@ -144,7 +144,7 @@ def test_pictures_can_be_left_away(scene, tmp_path):
 def test_the_log_of_density_control_adds_up(watched):
     trainer, _, _ = watched
     rounds = trainer.density.log.rounds
-    count = trainer.pace.start
+    count = trainer.run_schedule.start
     for r in rounds:
         count += r.cloned + r.split - r.pruned - r.merged
         assert r.count == count

@@ -40,7 +40,7 @@ class Heard(Callbacks):
         self.lines.append(text)
 
     def tick(self, trainer) -> None:
-        self.starts.append(trainer.pace.start)
+        self.starts.append(trainer.run_schedule.start)
 
 
 def wall_points(path: Path, count: int, shift: float | np.ndarray = 0.0) -> Path:

@@ -12,7 +12,7 @@ from ambiguous_wild.methods.gsw import GswAppearance, GswConfig, Visibility
 from ambiguous_wild.methods.masking_common import d_keep
 from ambiguous_wild.methods.splatfactow import SplatfactoDensity, trimmed
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.autograd_effect import Visible
+from ambiguous_wild.splat.effects.autograd_effect import VisibleGaussians
 from ambiguous_wild.splat.effects.geometry import (
     directions,
     frequencies,
@@ -129,7 +129,7 @@ def visible_of(effect, n=5):
     g = gaussians(n=n, rest=3)
     g.means.copy_(torch.tensor([0.0, 0.0, 4.0]) + 0.5 * (random(n, 3) - 0.5))
     extra = {name: row.values for name, row in effect.rows(g).items()}
-    return Visible(torch.zeros(n, 3), g.means, extra)
+    return VisibleGaussians(torch.zeros(n, 3), g.means, extra)
 
 
 def test_colours_by_a_second_implementation(gsw):
@@ -309,7 +309,7 @@ def test_colours_start_at_degree_zero(scene, tmp_path):
     context = shot_of(trainer.data)
     leaf = {**effect._leaf(context), "rest_bias0": torch.ones(45)}
     g = trainer.gaussians
-    visible = Visible(torch.zeros(len(g), 3), g.means, g.attributes)
+    visible = VisibleGaussians(torch.zeros(len(g), 3), g.means, g.attributes)
     early, late = (effect.forward(visible, leaf, replace(context, nominal=n)) for n in (1000.0, 2000.0))
     # features are zero: every Gaussian has the photo's one colour, until directions count
     torch.testing.assert_close(early, early[:1].expand_as(early))
@@ -344,7 +344,7 @@ def test_it_starts_as_3dgs_but_for_little(swag):
     trainer, effect = swag
     context = shot_of(trainer.data)
     base = random(len(trainer.gaussians), 3)
-    colours = effect.forward(Visible(base, trainer.gaussians.means), effect._leaf(context), context)
+    colours = effect.forward(VisibleGaussians(base, trainer.gaussians.means), effect._leaf(context), context)
     assert float((colours - base).abs().max()) < 0.1
     assert effect.change(trainer.gaussians, effect._leaf(context), context) == {}  # gates have not begun
 

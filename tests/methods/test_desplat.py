@@ -86,7 +86,7 @@ def test_only_the_layer_of_the_view_learns(scene, tmp_path):
     others = trainer.drawing.others
     before = {name: field.gaussians.sh0.clone() for name, field in others.items()}
     trainer.step()
-    seen = str(trainer.pace.view(1))
+    seen = str(trainer.run_schedule.view(1))
     assert {name for name, field in others.items() if not torch.equal(field.gaussians.sh0, before[name])} == {
         seen
     }

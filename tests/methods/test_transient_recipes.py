@@ -12,7 +12,7 @@ from ambiguous_wild.methods.forestsplats import fill
 from ambiguous_wild.methods.hybridgs import COVERED, composed, planar_sums
 from ambiguous_wild.methods.nexussplats import GEOMETRY, SHIFT, as_colour, boundary, kept
 from ambiguous_wild.methods.t3dgs import TwoErrorHead, divergence, inverse_depth, likelihood_loss, variation
-from ambiguous_wild.splat.effects.autograd_effect import Visible
+from ambiguous_wild.splat.effects.autograd_effect import VisibleGaussians
 from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.gaussians import SH_C0
 from ambiguous_wild.splat.losses import photometric
@@ -136,7 +136,7 @@ def test_dropout_follows_the_hidden_layers_in_training_alone(nexus, view):
     ones["toned_weight0"].zero_(), ones["toned_bias0"].fill_(1.0), ones["toned_weight1"].copy_(torch.eye(8))
     ones["toned_weight2"].fill_(0.01)
     base = torch.zeros(len(g), 3)
-    colours = effect.forward(Visible(base, g.means, g.attributes), ones, context)
+    colours = effect.forward(VisibleGaussians(base, g.means, g.attributes), ones, context)
     # of 8 units each is kept twice with probability 0.8 and then scaled by 1 / 0.8^2
     units = torch.logit((colours[:, 0] + 1) / 2) / 0.01 * (0.64 if view == 0 else 1.0)
     assert units.round().sub(units).abs().max() < 1e-2 and units.max() <= 8.01

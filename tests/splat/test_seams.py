@@ -1,4 +1,4 @@
-"""What methods may rely on: pulls are values, state travels with a Gaussian, statistics are asked for."""
+"""What methods may rely on: vjps are values, state travels with a Gaussian, statistics are asked for."""
 
 from dataclasses import replace
 

@@ -31,7 +31,13 @@ from ambiguous_wild.io.files import folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.entry import trained_once
 from ambiguous_wild.methods.graft import graft_pairs, split_graft
-from ambiguous_wild.methods.references import EXTERNAL, MASKS, NERFBASELINES, reference_file, with_file
+from ambiguous_wild.methods.references import (
+    EXTERNAL,
+    MASKS,
+    NERFBASELINES,
+    reference_file,
+    replace_reference_file,
+)
 from ambiguous_wild.methods.registry import get_method, load_plugin, load_reference
 from ambiguous_wild.splat.train_config import TrainConfig
 
@@ -198,7 +204,10 @@ def _load(source: CodeSource) -> None:
     elif source.kind == "metric":
         load_metrics(path)
     else:
-        load_reference(with_file(source.text, path), given_as=with_file(source.text, Path(source.path)))
+        load_reference(
+            replace_reference_file(source.text, path),
+            given_as=replace_reference_file(source.text, Path(source.path)),
+        )
 
 
 @functools.cache

@@ -46,7 +46,7 @@ def build(options: AbsGsConfig) -> MethodHooks:
     return MethodHooks(density=AbsDensity, density_config=options)
 
 
-class AbsoluteSums(DensityControl):
+class AbsoluteGradientSums(DensityControl):
     """Density control that also sums the absolute gradients."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"absolute"})
@@ -65,7 +65,7 @@ class AbsoluteSums(DensityControl):
         self.abs_sum += torch.where(step.rendered.visible, norms, torch.zeros_like(norms))
 
 
-class AbsDensity(AbsoluteSums):
+class AbsDensity(AbsoluteGradientSums):
     """Small Gaussians grow by the signed gradient, large ones by the absolute."""
 
     config: AbsGsConfig

@@ -40,7 +40,7 @@ _TAIL_BYTES, _TAIL_LINES = 8192, 4
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f]")
 
 
-def stage(scene: Scene, folder: Path, files: Mapping[str, str], *, photos: Photos = "all") -> Path:
+def stage_scene(scene: Scene, folder: Path, files: Mapping[str, str], *, photos: Photos = "all") -> Path:
     """Make the copy of the scene that a program gets.
 
     Args:

@@ -60,7 +60,7 @@ def build(options: McmcConfig) -> MethodHooks:
     )  # fmt: skip
 
 
-def divided(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+def relocation(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     """Return opacity [n] and scale factor [n] with which m `copies` [n] look like one Gaussian."""
     # o' = 1 - (1 - o)^(1/m), D = sum_i sum_k C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1), summed over i first
     o, m, k = opacity.double(), copies.clamp(max=51), np.arange(1, 52)
@@ -127,7 +127,7 @@ class McmcDensity(DensityControl):
         share = torch.where(among, torch.sigmoid(g.opacity_logits), 0.0).double().cpu().numpy()
         drawn = torch.from_numpy(self.rng.choice(len(share), count, p=share / share.sum())).to(g.device)
         rows, times = drawn.unique(return_counts=True)
-        opacity, factor = divided(torch.sigmoid(g.opacity_logits[rows]), 1 + times)
+        opacity, factor = relocation(torch.sigmoid(g.opacity_logits[rows]), 1 + times)
         g.opacity_logits[rows] = torch.logit(opacity)
         g.log_scales[rows] += factor.log()[:, None]
         optimiser.reset_moments(list(optimiser.rates), rows)

@@ -310,7 +310,7 @@ class RobustSplatMask(CountingMask, PausingMask):
         self.histogram = masking_common.update_histogram(self.histogram, e, config.decay)
         size = step.photo.shape[:2]
         lower, upper = (
-            resized(masking_common.bound(e, masking_common.percentile(self.histogram, share)), *size)
+            resized(masking_common.inlier_map(e, masking_common.percentile(self.histogram, share)), *size)
             for share in (config.lower, config.upper)
         )
         return lower, upper

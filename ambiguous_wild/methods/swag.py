@@ -99,7 +99,7 @@ def hash_encoding(unit: Tensor, grid: Tensor, coarsest: int, finer: float) -> Te
     unit = unit.detach().to(grid).clamp(0.0, 1.0)
     cells = [float(int(coarsest * finer**level)) for level in range(len(grid))]
     if not backend_of(grid.device).kernels or grid.dtype != torch.float32:
-        return in_torch(unit, grid, cells)
+        return hash_encoding_torch(unit, grid, cells)
     code: Tensor = _Encoding.apply(unit, grid, torch.tensor(cells))
     return code
 
@@ -111,7 +111,7 @@ def prepare(device: torch.device) -> None:
         torch.autograd.grad(hash_encoding(grid.new_zeros(1, 3), grid, 1, 1.0).sum(), grid)
 
 
-def in_torch(unit: Tensor, grid: Tensor, cells: list[float]) -> Tensor:
+def hash_encoding_torch(unit: Tensor, grid: Tensor, cells: list[float]) -> Tensor:
     """Do as `hash_encoding` in torch, for accelerators, and to check the kernel."""
     levels, entries, _ = grid.shape
     scaled = torch.stack([unit * count for count in cells])  # [L, N, 3]

@@ -126,7 +126,7 @@ class WildGaussiansConfig:
 def build(options: WildGaussiansConfig) -> MethodHooks:
     """Return 3DGS with the masks, the appearance, or both."""
     effects = (WildAppearance(options),) if options.appearance else ()
-    return MethodHooks(mask=Uncertainty(options) if options.masks else MaskPolicy(), effects=effects)
+    return MethodHooks(mask=UncertaintyMask(options) if options.masks else MaskPolicy(), effects=effects)
 
 
 class WildAppearance(AutogradEffect):
@@ -208,7 +208,7 @@ def uncertainty_loss(sigma: Tensor, distance: Tensor, prior: float) -> Tensor:
     return (distance * 0.5 / sigma.square()).mean() + prior * sigma.log().mean()
 
 
-class Uncertainty(CountingMask, PausingMask):
+class UncertaintyMask(CountingMask, PausingMask):
     """Keeps pixels with 1 / (2 sigma^2) > 1; the head learns in every step, but not after opacity resets."""
 
     config: WildGaussiansConfig

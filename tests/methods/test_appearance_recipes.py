@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from ambiguous_wild.methods import gsw as gs_w
-from ambiguous_wild.methods.gsw import GswAppearance, GswConfig, Visibility
+from ambiguous_wild.methods.gsw import GswAppearance, GswConfig, VisibilityMask
 from ambiguous_wild.methods.masking_common import d_keep
-from ambiguous_wild.methods.splatfactow import SplatfactoDensity, trimmed
+from ambiguous_wild.methods.splatfactow import SplatfactoDensity, trimmed_keep
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects.autograd_effect import VisibleGaussians
 from ambiguous_wild.splat.effects.geometry import (
@@ -140,7 +140,7 @@ def test_colours_by_a_second_implementation(gsw):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(effect, "config", replace(effect.config, residual=False))
         published = effect.forward(visible, leaf, context)
-    maps = gs_w.maps_of(data.photos[0], leaf, 32).numpy()
+    maps = gs_w.feature_maps(data.photos[0], leaf, 32).numpy()
     assert maps.shape[:2] == (3, 16)
 
     def bilinear(grid, x, y):
@@ -191,7 +191,7 @@ def test_without_a_photo_a_gaussian_samples_what_it_does_in_the_photos_that_show
         pixels, z = projected(visible.means, view)
         at = pixels / torch.tensor([view.width, view.height])
         shown = ((z > 0) & (at > 0).all(1) & (at < 1).all(1)).float()[:, None]
-        map_ = gs_w.maps_of(photo, leaf, 32)[2]
+        map_ = gs_w.feature_maps(photo, leaf, 32)[2]
         total, count = total + shown * gs_w.sample(map_, 2.0 * at - 1.0), count + shown
     assert count.min() >= 1 and count.max() > 1
     torch.testing.assert_close(found, total / count)
@@ -235,7 +235,7 @@ def test_a_test_photo_shows_its_left_half_and_nothing_is_fitted(gsw):
 def test_masks_settle_where_residual_and_prior_balance(gsw):
     """Without SSIM the optimum is M = 1 - 2.67 e; with it the gradient is that of the whole loss."""
     data, effect = gsw
-    policy = Visibility(effect)
+    policy = VisibilityMask(effect)
     step, mask = step_of(data, 0, data.photos[0] * 0.5), random(48, 64)
     found = policy.d_mask(step, mask)
 
@@ -253,10 +253,10 @@ def test_masks_settle_where_residual_and_prior_balance(gsw):
 def test_what_is_trimmed_by_hand():
     error = torch.zeros(20, 20)
     error[5, 5], error[14:18, 14:18] = 0.9, 0.8
-    keep = trimmed(error, torch.tensor(17 / 400))
+    keep = trimmed_keep(error, torch.tensor(17 / 400))
     # a pixel alone is kept for its neighbours' sake, a block loses its middle and edges
     assert keep[5, 5] == 1 and not keep[15:17, 15:17].any() and keep[:13].all()
-    assert trimmed(error, torch.tensor(0.0)).all()
+    assert trimmed_keep(error, torch.tensor(0.0)).all()
 
 
 def test_masks_take_more_the_larger_the_loss_and_never_the_upper_part(scene, tmp_path):

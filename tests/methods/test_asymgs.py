@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from ambiguous_wild.methods.asymgs import (
+    AlternatingMask,
     AsymGsConfig,
-    AsymMask,
-    SlowAverage,
-    SlowDensity,
-    slow,
-    slow_gaussians,
+    EmaDensity,
+    ParameterEma,
+    ema_attribute,
+    ema_gaussians,
 )
 from ambiguous_wild.vision.mask_ops import keep_unsuspicious, unsupported
 from tests.methods.baselines import data_of, parts_of, step_of, trained, trainer_of
@@ -23,13 +23,13 @@ from tests.splat.scenes import gaussians
 def seen(scene, tmp_path_factory):
     """The training side, and a mask policy that was shown it."""
     data = data_of(scene, tmp_path_factory.mktemp("cache"))
-    mask = AsymMask(AsymGsConfig())
+    mask = AlternatingMask(AsymGsConfig())
     mask.setup(data)
     return data, mask
 
 
 def averaged(g):
-    effect = SlowAverage(0.8)
+    effect = ParameterEma(0.8)
     return effect, g.carrying({name: row.values for name, row in effect.rows(g).items()})
 
 
@@ -38,22 +38,22 @@ def test_the_average_by_hand():
     first = g.means.clone()
     g.means += 1.0
     effect.after_step(None, g)
-    assert torch.allclose(g.attributes[slow("means")], first + 0.2)
+    assert torch.allclose(g.attributes[ema_attribute("means")], first + 0.2)
     effect.after_step(None, g)
-    assert torch.allclose(g.attributes[slow("means")], first + 0.36)
-    teacher = slow_gaussians(g)
+    assert torch.allclose(g.attributes[ema_attribute("means")], first + 0.36)
+    teacher = ema_gaussians(g)
     assert torch.equal(teacher.means, g.attributes["slow_means"]) and torch.equal(teacher.sh_rest, g.sh_rest)
-    assert slow_gaussians(gaussians(n=4)) is None
+    assert ema_gaussians(gaussians(n=4)) is None
 
 
 def test_a_child_of_a_split_averages_from_where_it_lies():
     _, g = averaged(gaussians(n=4, rest=3))
-    g.attributes[slow("quats")][:] = 7.0
-    child = SlowDensity(AsymGsConfig().density, 1.0, 0)._split_half(g.select(torch.arange(4)))
+    g.attributes[ema_attribute("quats")][:] = 7.0
+    child = EmaDensity(AsymGsConfig().density, 1.0, 0)._split_half(g.select(torch.arange(4)))
     assert not torch.equal(child.means, g.means)
-    assert torch.equal(child.attributes[slow("means")], child.means)
-    assert torch.equal(child.attributes[slow("log_scales")], child.log_scales)
-    assert torch.equal(child.attributes[slow("quats")], torch.full((4, 4), 7.0))
+    assert torch.equal(child.attributes[ema_attribute("means")], child.means)
+    assert torch.equal(child.attributes[ema_attribute("log_scales")], child.log_scales)
+    assert torch.equal(child.attributes[ema_attribute("quats")], torch.full((4, 4), 7.0))
 
 
 def test_instances_more_suspect_than_the_photo_go_by_hand():
@@ -144,7 +144,7 @@ def test_growth_carries_the_average(scene, tmp_path):
     g = trainer.gaussians
     assert sum(r.split for r in trainer.density.log.rounds) > 0
     assert all(len(tensor) == len(g) for tensor in g.attributes.values())
-    gap = (g.attributes[slow("means")] - g.means).norm(dim=1)
+    gap = (g.attributes[ema_attribute("means")] - g.means).norm(dim=1)
     assert 0 < float(gap.median()) < 0.01 * trainer.data.scene.extent
 
 
@@ -159,4 +159,4 @@ def test_the_average_is_not_that_of_postponed_harmonics(scene, tmp_path):
             break
         trainer.optimiser.flush()
         want.lerp_(trainer.gaussians.sh_rest, 0.2)
-        assert torch.equal(trainer.gaussians.attributes[slow("sh_rest")], want)
+        assert torch.equal(trainer.gaussians.attributes[ema_attribute("sh_rest")], want)

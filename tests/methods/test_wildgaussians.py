@@ -99,7 +99,7 @@ def test_it_masks_what_only_one_photo_shows_and_can_do_without_either_part(tmp_p
     inside, outside = masked_more_inside(trainer)
     assert inside < outside - 0.3, (inside, outside)
     alone = parts_of("wildgaussians", appearance="false")
-    assert not alone.effects and type(alone.mask).__name__ == "Uncertainty"
+    assert not alone.effects and type(alone.mask).__name__ == "UncertaintyMask"
     colours = parts_of("wildgaussians", masks="false")
     assert colours.effects and type(colours.mask).__name__ == "MaskPolicy"
 

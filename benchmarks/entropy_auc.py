@@ -33,7 +33,7 @@ from job_queue import exit_code, find_scenes
 from scipy.stats import rankdata
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.regions import true_distractor
+from ambiguous_wild.harness.regions import exact_distractor
 from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
@@ -93,7 +93,7 @@ def judged(data: TrainData, renders: Sequence[torch.Tensor], backend: str, sigma
     grouped: dict[str, list[np.ndarray]] = {name: [] for name in STATISTICS}
     truth, guilty, sizes = [], [], []
     for view, render in enumerate(renders):
-        mask = true_distractor(data.scene, data.scene.train[view])
+        mask = exact_distractor(data.scene, data.scene.train[view])
         if mask is None:
             continue
         maps = _maps(found, view, render, data.photos[view], features, sigma)

@@ -24,7 +24,7 @@ from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.core.errors import installed
 from ambiguous_wild.core.machine import usable_cores
 from ambiguous_wild.core.processes import own_commit
-from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_protocol
+from ambiguous_wild.harness.chosen_effects import ChosenEffects, mixed_tests, scene_protocol
 from ambiguous_wild.harness.command_lines import bench_command, length_options, length_text, option_text
 from ambiguous_wild.harness.measures import ImageRow, records
 from ambiguous_wild.harness.result_file import (
@@ -164,7 +164,7 @@ class Cell:
     scene_id: str  # sha256 of what the scene was built from, see `scene_identity`
     train: TrainConfig
     device: str = "cpu"
-    chosen: Chosen = field(default_factory=Chosen)  # optional effects, and the reasons for them
+    chosen: ChosenEffects = field(default_factory=ChosenEffects)  # optional effects, and the reasons for them
     protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
     start: StartFile | None = None  # what it starts from instead of the scene's points
     corrections: CorrectionsFile | None = None  # masks corrected by hand

@@ -22,7 +22,7 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.harness.cell import Cell, CellReport, RunOptions, code_hash, scene_identity
 from ambiguous_wild.harness.cell_run import error_line, run_cell
-from ambiguous_wild.harness.chosen_effects import Chosen
+from ambiguous_wild.harness.chosen_effects import ChosenEffects
 from ambiguous_wild.harness.measures import load_metrics
 from ambiguous_wild.harness.result_file import FAILED, RESULT, RunConfig, write_result
 from ambiguous_wild.harness.start import recorded_start
@@ -60,7 +60,7 @@ class Job:
     """The values to make a cell again and run it."""
 
     config: RunConfig
-    chosen: Chosen
+    chosen: ChosenEffects
     identity: str
     scene: str  # absolute path
     folder: str  # absolute path of the run folder

@@ -221,7 +221,7 @@ def users_metrics() -> dict[str, Metric]:
     return {key: m for key, m in metrics().items() if key not in MEASURES}
 
 
-def try_own(scene: Scene) -> None:
+def check_user_metrics(scene: Scene) -> None:
     """Raise AwError if a user's metric fails on a test photo against itself; called before training."""
     for view in scene.test[:1] if (mine := users_metrics()) else ():
         photo = read_png_rgb(view.image_path)

@@ -249,7 +249,7 @@ def _find_regions(scene: Scene) -> Regions:
         pixels[CONSISTENT] = consistent
     else:
         missing[CONSISTENT] = "no pixel of a test photo looks as train photos show its surface"
-    masks_of_train = [true_distractor(scene, view) for view in scene.train]
+    masks_of_train = [exact_distractor(scene, view) for view in scene.train]
     visibility = train_visibility(scene, masks_of_train)
     if isinstance(visibility, str):
         return Regions(pixels, missing | dict.fromkeys((COVERED, UNCOVERED, SUPPORTED), visibility))
@@ -268,12 +268,12 @@ def _find_regions(scene: Scene) -> Regions:
     return Regions(pixels, missing)
 
 
-def true_distractor(scene: Scene, view: View) -> np.ndarray | None:
+def exact_distractor(scene: Scene, view: View) -> np.ndarray | None:
     """Return the exact mask of a photo, [H, W] bool, True on distractors; None if the capture has none."""
     return _exact(scene, view, "distractor")
 
 
-def true_shadow(scene: Scene, view: View) -> np.ndarray | None:
+def exact_shadow(scene: Scene, view: View) -> np.ndarray | None:
     """Return where distractors change a photo without being there, [H, W] bool; None if nowhere."""
     return _exact(scene, view, "shadow")
 

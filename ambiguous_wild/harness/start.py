@@ -56,7 +56,7 @@ def start_file(path: Path) -> StartFile:
     return StartFile(path.resolve(), sha256_file(path), count, "splats" if is_splats else "points")
 
 
-def started(hooks: MethodHooks, start: StartFile | None, scene: Scene) -> MethodHooks:
+def with_start(hooks: MethodHooks, start: StartFile | None, scene: Scene) -> MethodHooks:
     """Return the hooks of a method with the content of the file to start from.
 
     Raises:

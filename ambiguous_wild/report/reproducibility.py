@@ -19,7 +19,7 @@ from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.cell import code_hash, commit
 from ambiguous_wild.harness.command_lines import length_text
 from ambiguous_wild.harness.result_file import Environment, RunConfig, RunResult
-from ambiguous_wild.harness.store import checked_result, effects_of, find_runs, read_config, section
+from ambiguous_wild.harness.store import checked_result, config_section, effects_of, find_runs, read_config
 from ambiguous_wild.report.board import hidden_in
 from ambiguous_wild.report.board_reproduce import Scenes, command_words, preparation
 from ambiguous_wild.report.plain_formats import WIDTH, markdown_text
@@ -139,7 +139,7 @@ def _seeds(runs: Iterable[_Run]) -> list[str]:
 
 
 def _length(run: _Run) -> str:
-    train = section(dict(run.config), "train") if run.config else {}
+    train = config_section(dict(run.config), "train") if run.config else {}
     length = run.result["facts"].get("length")
     return str(
         length or length_text(train.get("iterations"), train.get("budget_s")) or "an unrecorded length"
@@ -207,7 +207,7 @@ def _repeats(runs: Sequence[_Run]) -> str:
 
 def _why_not(run: _Run) -> str:
     """Return why a run does not repeat bit for bit, of "they ..."; empty if it does."""
-    train = section(dict(run.config), "train") if run.config else {}
+    train = config_section(dict(run.config), "train") if run.config else {}
     if not train:
         return "are of another program"
     if not str(run.result["cost"].get("device", "")).startswith("cpu"):

@@ -110,7 +110,7 @@ def advance(trainer: Trainer, tick: Tick | None = None) -> None:
     if tick is not None:
         tick(trainer)
     if meter is not None and calibrating:
-        meter.look(trainer.clock.now())
+        meter.calibrate(trainer.clock.now())
 
 
 def _marks(trainer: Trainer) -> tuple[int, int]:

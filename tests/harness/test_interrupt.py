@@ -12,7 +12,7 @@ from ambiguous_wild.cli import main
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.benchmark import Callbacks, bench
 from ambiguous_wild.harness.store import run_folders
-from ambiguous_wild.harness.trained_models import find_models
+from ambiguous_wild.harness.trained_models import find_run_models
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.splat.training_loop import Stopped, deferred
 from tests.tiny_scene import write_tiny_scene
@@ -63,7 +63,7 @@ def test_the_model_is_kept_and_the_same_command_goes_on(tmp_path: Path, scene: P
     assert len(read_splat_ply(kept / "point_cloud.ply")["means"]) > 3
     assert list(run_folders(tmp_path / "runs")) == [run]  # what is kept is no run of its own
     with pytest.raises(AwError, match=f"is not finished: .*its model is {kept / 'point_cloud.ply'}"):
-        find_models([tmp_path / "runs"])
+        find_run_models([tmp_path / "runs"])
 
     (again,) = train(scene, tmp_path / "runs").runs
     (whole,) = train(scene, tmp_path / "whole").runs

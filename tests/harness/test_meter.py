@@ -51,7 +51,7 @@ def meter(tmp_path: Path, *, kernel: list[float] | None = None, threads: int = C
 def measured(m: Meter, m_work, seconds: float = 40.0, **how: float) -> tuple[str, str]:
     m.begin(0.0)
     m_work(seconds, **how)
-    m.look(seconds)
+    m.calibrate(seconds)
     m.end()
     return m.verdict(seconds)
 
@@ -77,7 +77,7 @@ def test_a_load_that_others_brought_once_is_not_forgotten(tmp_path, monkeypatch)
     m.begin(0.0)
     for k in range(4):
         here.work(10.0, others=2.0 if k == 0 else 0.0)
-        m.look(10.0 * (k + 1))
+        m.calibrate(10.0 * (k + 1))
     m.end()
     assert m.verdict(40.0) == ("contended", "other programs used 0.5 of 4 processors")
 
@@ -86,7 +86,7 @@ def sampled(m: Meter, here: Machine, seconds: int) -> tuple[str, str]:
     m.begin(0.0)
     for k in range(1, seconds + 1):
         here.work(1.0)
-        m.look(float(k))
+        m.calibrate(float(k))
     m.end()
     return m.verdict(float(seconds))
 
@@ -106,7 +106,7 @@ def test_a_run_that_was_calibrated_late_is_unknown(tmp_path, monkeypatch):
     here, m = Machine(monkeypatch), meter(tmp_path)
     m.begin(30.0)
     here.work(10.0)
-    m.look(40.0)
+    m.calibrate(40.0)
     assert m.verdict(40.0) == ("unknown", "calibrations cover 25 % of the training")
 
 
@@ -133,7 +133,7 @@ def test_load_slows_what_is_serial_less_and_cancels_out(tmp_path, monkeypatch, p
         m = Meter("cpu", 2, read=lambda r=reading: r, presence=ActiveRuns("cpu", tmp_path))
         m.begin(0.0)
         here.wall, here.own = here.wall + wall, here.own + 30.0 + parallel_s
-        m.look(wall)
+        m.calibrate(wall)
         m.end()
         cost = m.cost(wall)
         # busy, the same work in parallel is a larger share of the time
@@ -167,7 +167,7 @@ def test_calibrations_come_often_at_first_and_every_fifteen_seconds_later(tmp_pa
         m.begin(0.0)
         for k in range(1, round(total / step) + 1):
             if m.due(k * step, k * step / total):
-                m.look(k * step)
+                m.calibrate(k * step)
         m.end()
         times = [sample[0] for sample in m.samples]
         assert fewest <= len(times) <= most
@@ -179,7 +179,7 @@ def test_the_state_of_a_meter_goes_on_after_a_kill(tmp_path, monkeypatch):
     here, m = Machine(monkeypatch), meter(tmp_path)
     m.begin(0.0)
     here.work(20.0, others=2.0)
-    m.look(20.0)
+    m.calibrate(20.0)
     here.work(10.0, others=2.0)
     state = m.state_dict()
     m.end()
@@ -187,7 +187,7 @@ def test_the_state_of_a_meter_goes_on_after_a_kill(tmp_path, monkeypatch):
     other.load_state_dict(state)
     other.begin(30.0)
     here.work(10.0)
-    other.look(40.0)
+    other.calibrate(40.0)
     other.end()
     assert other.verdict(40.0) == ("contended", "other programs used 1.5 of 4 processors")
     assert [sample[0] for sample in other.samples] == [0.0, 20.0, 30.0, 40.0]
@@ -198,11 +198,11 @@ def test_a_rollback_keeps_what_was_spent_and_seen(tmp_path, monkeypatch):
     before_the_run = m.state_dict()
     m.begin(0.0)
     here.work(20.0, others=2.0)
-    m.look(20.0)
+    m.calibrate(20.0)
     m.load_state_dict(before_the_run)
     assert not m.due(20.5, 0.5)
     here.work(20.0)
-    m.look(40.0)
+    m.calibrate(40.0)
     assert m.verdict(40.0) == ("contended", "other programs used 1.0 of 4 processors")
 
 

@@ -346,7 +346,7 @@ def _metrics() -> list[SystemCheck]:
         missing = lpips.missing_weights(metric)
         detail = f"weights missing: {', '.join(missing)}" if missing else "weights found"
         checks.append(
-            _optional(metric, not missing, detail, weight_registry.fix(*missing) if missing else "")
+            _optional(metric, not missing, detail, weight_registry.download_hint(*missing) if missing else "")
         )
     return checks
 

@@ -32,7 +32,7 @@ from ambiguous_wild.vision.sparse_surface import (
     in_map,
     inside,
     inverse_depth,
-    some_points,
+    subsample_points,
     world_points,
 )
 
@@ -63,7 +63,7 @@ def train_visibility(scene: Scene, masks: Sequence[np.ndarray | None]) -> dict[s
     """
     exact = any(mask is not None for mask in masks)
     used = [(view, mask) for view, mask in zip(scene.train, masks) if mask is not None or not exact]
-    xyz = some_points(scene.points.sure_xyz)
+    xyz = subsample_points(scene.points.sure_xyz)
     cameras = [view.camera for view, _ in used]
     depths = [inverse_depth(camera, xyz) for camera in cameras]
     visibility = {}
@@ -97,7 +97,7 @@ def photo_consistency(scene: Scene) -> dict[str, np.ndarray] | str:
         By the name of the test view: [H, W] bool, False where fewer than three train photos show the surface;
         or why no pixel can be compared.
     """
-    xyz = some_points(scene.points.sure_xyz)
+    xyz = subsample_points(scene.points.sure_xyz)
     cameras = [view.camera for view in scene.train]
     depths = [inverse_depth(camera, xyz) for camera in cameras]
     photos = {k: _small(scene.train[k], depth.shape) for k, depth in enumerate(depths) if depth is not None}

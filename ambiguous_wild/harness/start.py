@@ -107,7 +107,7 @@ def _check_position(path: Path, xyz: np.ndarray, scene: Scene) -> None:
     """Refuse points [N, 3] that lie far from the scene's points; warn if few of them lie near."""
     from scipy.spatial import cKDTree
 
-    from ambiguous_wild.vision.sparse_surface import some_points
+    from ambiguous_wild.vision.sparse_surface import subsample_points
 
     points = scene.points.xyz
     if len(points) < _FEW_POINTS:
@@ -115,7 +115,7 @@ def _check_position(path: Path, xyz: np.ndarray, scene: Scene) -> None:
     cameras = cKDTree([view.camera.center for view in scene.train])
     shares = [
         float((cKDTree(others).query(some)[0] < _NEAR * cameras.query(some)[0]).mean())
-        for some, others in ((some_points(xyz), points), (some_points(points), xyz))
+        for some, others in ((subsample_points(xyz), points), (subsample_points(points), xyz))
     ]  # the greater counts: each of the two may cover a part of the scene alone
     if max(shares) < _FEW_NEAR:
         middle = np.median(xyz, axis=0) / scene.transform.scale + scene.transform.centre

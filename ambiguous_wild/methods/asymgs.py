@@ -39,7 +39,7 @@ from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks, Schedule
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 from ambiguous_wild.vision.backends import make_features, make_instances
-from ambiguous_wild.vision.mask_ops import keep_unsuspicious, unsupported
+from ambiguous_wild.vision.mask_ops import drop_static_instances, keep_from_suspects
 from ambiguous_wild.vision.precompute import instance_labels, photo_features
 
 TWIN = "twin"
@@ -121,7 +121,7 @@ class AlternatingMask(MaskPolicy):
         self.phi = photo_features(self.features, data.photos, data.cache_dir)
         names, least = [view.name for view in data.scene.train], self.config.support
         labelled = zip(instance_labels(self.instances, data.photos, names, data.cache_dir).labels, names)
-        suspects = (unsupported(labels, data.scene, name, least) for labels, name in labelled)
+        suspects = (drop_static_instances(labels, data.scene, name, least) for labels, name in labelled)
         self.labels = [torch.from_numpy(labels).to(data.device) for labels in suspects]
         self.soft = [RowAdam(torch.ones(1, *x.shape, device=data.device)) for x in self.labels]
 
@@ -156,7 +156,7 @@ class AlternatingMask(MaskPolicy):
         error = residual(step.photo, step.rendered.image)
         suspect = error > torch.quantile(error, self.config.colour)
         suspect &= distance > torch.quantile(distance, self.config.feature)
-        return keep_unsuspicious(nearest(self.labels[step.view], *size), suspect)
+        return keep_from_suspects(nearest(self.labels[step.view], *size), suspect)
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | None:
         if step.nominal <= self.config.warm_up or not (teacher := ema_gaussians(step.gaussians)):

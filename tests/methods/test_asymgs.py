@@ -14,7 +14,7 @@ from ambiguous_wild.methods.asymgs import (
     ema_attribute,
     ema_gaussians,
 )
-from ambiguous_wild.vision.mask_ops import keep_unsuspicious, unsupported
+from ambiguous_wild.vision.mask_ops import drop_static_instances, keep_from_suspects
 from tests.methods.baselines import data_of, parts_of, step_of, trained, trainer_of
 from tests.splat.scenes import gaussians
 
@@ -61,7 +61,7 @@ def test_instances_more_suspect_than_the_photo_go_by_hand():
     suspect = torch.zeros(3, 4, dtype=torch.bool)
     suspect[0, 0] = suspect[0, 2] = suspect[0, 3] = suspect[2, 2] = True
     suspect[1, 0] = True  # shares: photo 5/12, label 1 2/4, label 2 1/4, label 3 1/2
-    assert keep_unsuspicious(labels, suspect).tolist() == [[1, 1, 0, 0], [1, 1, 0, 0], [1, 1, 0, 0]]
+    assert keep_from_suspects(labels, suspect).tolist() == [[1, 1, 0, 0], [1, 1, 0, 0], [1, 1, 0, 0]]
 
 
 def test_instances_with_points_are_static():
@@ -75,14 +75,18 @@ def test_instances_with_points_are_static():
     )
     scene = SimpleNamespace(points=points, views=[SimpleNamespace(name="a"), SimpleNamespace(name="b")])
     # four points in label 1; the one in label 3 has two observations and is not counted
-    assert unsupported(labels, scene, "b", 0.1).tolist() == [[0, 0, 2, 2], [0, 0, 2, 2], [0, 0, 3, 3]]
-    assert unsupported(labels, scene, "b", 0.1, least_track=2).tolist() == [
+    assert drop_static_instances(labels, scene, "b", 0.1).tolist() == [
+        [0, 0, 2, 2],
+        [0, 0, 2, 2],
+        [0, 0, 3, 3],
+    ]
+    assert drop_static_instances(labels, scene, "b", 0.1, least_track=2).tolist() == [
         [0, 0, 2, 2],
         [0, 0, 2, 2],
         [0] * 4,
     ]
     # density of label 1 is three times that of the photo
-    assert unsupported(labels, scene, "b", 3.5)[0, 0] == 1
+    assert drop_static_instances(labels, scene, "b", 3.5)[0, 0] == 1
 
 
 def test_the_soft_mask_starts_open_and_closes_where_features_differ(seen):

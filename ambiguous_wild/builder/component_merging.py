@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambiguous_wild.builder.matched import Matched, PointLookup
+from ambiguous_wild.builder.matched import MatchedPhotos, PointLookup
 from ambiguous_wild.builder.registration import (
     ALIKE_DEG,
     INLIER_RATIO,
@@ -21,7 +21,7 @@ from ambiguous_wild.builder.registration import (
     Registration,
     centre_of,
 )
-from ambiguous_wild.builder.relative_poses import Pair, trace_of
+from ambiguous_wild.builder.relative_poses import Pair, rotation_trace
 
 MIN_MERGE_PAIRS = 2  # pairs across two components that must support the merge; they involve one more photo
 # Smallest singular value of the equations for scale and shift, relative to the largest: along a straight path
@@ -42,24 +42,27 @@ class Similarity:
     rotation: np.ndarray  # [3, 3]
     shift: np.ndarray  # [3]
 
-    def moved(self, pose: np.ndarray) -> np.ndarray:
+    def transform_pose(self, pose: np.ndarray) -> np.ndarray:
         """Return a pose [3, 4], camera from world, in the coordinates of the first component."""
         rotation = pose[:, :3] @ self.rotation.T
         return np.column_stack([rotation, self.scale * pose[:, 3] - rotation @ self.shift])
 
 
-def merge(first: Registration, second: Registration) -> bool:
+def merge_components(first: Registration, second: Registration) -> bool:
     """Add the photos of the second component if enough pairs support it; the first must then run again."""
     added = {photo: pose for photo, pose in second.poses.items() if photo not in first.poses}
     if not added or min(len(first.poses), len(second.poses)) < MIN_MODEL_PHOTOS:
         return False
-    rotations = _rotations(first, second)
+    rotations = _implied_rotations(first, second)
     alike = _alike(rotations)
     before = [list(camera.params) for camera in first.matched.cameras]  # params are a view
     _take_cameras(first, second, added)
     best: tuple[int, Similarity] | None = None
-    for similarity in (*_by_photos(first, second), *_by_pairs(first, second, rotations, alike)):
-        moved = {photo: similarity.moved(pose) for photo, pose in added.items()}
+    for similarity in (
+        *_similarities_from_photos(first, second),
+        *_similarities_from_pairs(first, second, rotations, alike),
+    ):
+        moved = {photo: similarity.transform_pose(pose) for photo, pose in added.items()}
         support = _supporting_pairs(first, moved)
         photos = {photo for pair in support for photo in pair}
         if len(support) < MIN_MERGE_PAIRS or len(photos) <= MIN_MERGE_PAIRS:
@@ -72,7 +75,7 @@ def merge(first: Registration, second: Registration) -> bool:
         for camera, params in zip(first.matched.cameras, before):
             camera.params = params
         return False
-    first.poses.update((photo, best[1].moved(pose)) for photo, pose in added.items())
+    first.poses.update((photo, best[1].transform_pose(pose)) for photo, pose in added.items())
     first.merged.append(frozenset(added))
     return True
 
@@ -86,7 +89,7 @@ def _take_cameras(first: Registration, second: Registration, added: Collection[i
 
 
 @dataclass(frozen=True)
-class Across:
+class ImpliedRotation:
     """The rotation between two components that a relative pose of a pair across them implies."""
 
     pair: Pair
@@ -96,9 +99,9 @@ class Across:
     direction: np.ndarray  # [3] from the first photo to the second, in the first component
 
 
-def _rotations(first: Registration, second: Registration) -> list[Across]:
+def _implied_rotations(first: Registration, second: Registration) -> list[ImpliedRotation]:
     """Return the rotations that the relative poses of the strongest pairs across two components imply."""
-    rows: list[Across] = []
+    rows: list[ImpliedRotation] = []
     of_pairs = first.matched.relative_poses.items()
     strongest = sorted(of_pairs, key=lambda item: -sum(len(relative.matches) for relative in item[1]))
     for pair, relative_poses in strongest:
@@ -112,24 +115,26 @@ def _rotations(first: Registration, second: Registration) -> list[Across]:
                 for rotation, shift in zip(relative_pose.rotations, relative_pose.translations):
                     centre = -rotation.T @ shift if here == pair[0] else shift
                     relative = rotation if here == pair[0] else rotation.T  # there from here
-                    rows.append(Across(pair, here, there, mine.T @ relative.T @ theirs, mine.T @ centre))
+                    rows.append(
+                        ImpliedRotation(pair, here, there, mine.T @ relative.T @ theirs, mine.T @ centre)
+                    )
     return rows
 
 
-def _alike(rows: Sequence[Across]) -> np.ndarray:
+def _alike(rows: Sequence[ImpliedRotation]) -> np.ndarray:
     """Tell which rows imply the same rotation, [N, N] bool."""
     stack = np.array([row.rotation for row in rows]).reshape(-1, 9)
-    return stack @ stack.T > trace_of(ALIKE_DEG)
+    return stack @ stack.T > rotation_trace(ALIKE_DEG)
 
 
 def _competing_pairs(
-    rows: Sequence[Across], alike: np.ndarray, similarity: Similarity, support: Collection[Pair]
+    rows: Sequence[ImpliedRotation], alike: np.ndarray, similarity: Similarity, support: Collection[Pair]
 ) -> int:
     """Return the largest number of pairs that agree on one rotation other than that of the similarity."""
     others = [
         k
         for k, row in enumerate(rows)
-        if row.pair not in support and np.sum(row.rotation * similarity.rotation) < trace_of(ALIKE_DEG)
+        if row.pair not in support and np.sum(row.rotation * similarity.rotation) < rotation_trace(ALIKE_DEG)
     ]
     if not others:
         return 0
@@ -138,8 +143,8 @@ def _competing_pairs(
     return int((alike[np.ix_(others, others)] @ owned > 0).sum(axis=1).max())
 
 
-def _by_pairs(
-    first: Registration, second: Registration, across: Sequence[Across], same: np.ndarray
+def _similarities_from_pairs(
+    first: Registration, second: Registration, across: Sequence[ImpliedRotation], same: np.ndarray
 ) -> Iterator[Similarity]:
     """Yield the similarities on which pairs across them agree, the rotation first, then directions."""
     known: set[frozenset[tuple[int, int]]] = set()
@@ -164,7 +169,7 @@ def _by_pairs(
             yield Similarity(float(scale) / second.radius, rotation, np.array(shift))
 
 
-def _by_photos(first: Registration, second: Registration) -> Iterator[Similarity]:
+def _similarities_from_photos(first: Registration, second: Registration) -> Iterator[Similarity]:
     """Yield the similarity that each pose of a photo in both components implies."""
     here, there = PointLookup.read(first.matched, first.model), PointLookup.read(second.matched, second.model)
     for photo in sorted({*first.poses, *second.poses}):
@@ -192,7 +197,7 @@ def _depths(
 
 def _supporting_pairs(first: Registration, moved: Mapping[int, np.ndarray]) -> set[Pair]:
     """Return the pairs across with a relative pose whose inliers are clustered in neither photo."""
-    matched: Matched = first.matched
+    matched: MatchedPhotos = first.matched
     normalised, poses = matched.normalised(), {**moved, **first.poses}
     support = set()
     for (a, b), relative_poses in matched.relative_poses.items():

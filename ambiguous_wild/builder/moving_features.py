@@ -17,7 +17,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ambiguous_wild.builder.matched import Matched
+from ambiguous_wild.builder.matched import MatchedPhotos
 from ambiguous_wild.builder.records import MotionResult
 from ambiguous_wild.builder.registration import INLIER_RATIO
 from ambiguous_wild.builder.relative_poses import MIN_INLIERS
@@ -51,7 +51,7 @@ class Votes:
 
 
 def count_votes(
-    matched: Matched, poses: Mapping[int, np.ndarray], voters: Collection[int]
+    matched: MatchedPhotos, poses: Mapping[int, np.ndarray], voters: Collection[int]
 ) -> dict[int, Votes]:
     """Count how many photos call each feature static or moving, by the matches among the voters.
 
@@ -126,7 +126,7 @@ def seen_through(model: pycolmap.Reconstruction, photos: Mapping[int, int]) -> d
 
 
 def motion_points(
-    matched: Matched,
+    matched: MatchedPhotos,
     poses: Mapping[int, np.ndarray],
     train: Collection[str],
     pinholes: Mapping[str, ModelCamera],
@@ -206,7 +206,7 @@ def write_motion(
         train: names of the train photos.
         threads: pairs of photos at a time.
     """
-    matched, colmap_model = Matched.read(database), pycolmap.Reconstruction(str(model))
+    matched, colmap_model = MatchedPhotos.read(database), pycolmap.Reconstruction(str(model))
     matched.take_cameras(colmap_model)
     matched.load_relative_poses(relative_poses)
     undistorted = read_model(flat)

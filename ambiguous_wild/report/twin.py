@@ -37,8 +37,8 @@ from ambiguous_wild.simulate.spec import (
     FULL_FRAME_DIAGONAL_MM,
     CaptureSpec,
     Defocus,
-    Designed,
     Effects,
+    ExpectedAmbiguity,
     ExposureDrift,
     IsoNoise,
     TimeOfDay,
@@ -167,7 +167,7 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0, views: int 
         arc_deg=round(arc_deg),
         zoom=zoom,
         effects=_effects(of, factor, seed, views or seen.photos),
-        designed=Designed(),
+        designed=ExpectedAmbiguity(),
     )
     spec = resized(check_spec(spec), views)
     return FittedSpec(spec, factor, tuple(_lines(of, spec, factor)))

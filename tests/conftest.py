@@ -106,7 +106,7 @@ def pytest_runtest_setup(item):
     """
     calibration = sys.modules.get("ambiguous_wild.splat.calibration")
     if calibration is not None:
-        calibration.KERNELS["cpu"] = calibration.Size("cpu-3", 0.0625, 300, 32, 32, 1)
+        calibration.KERNELS["cpu"] = calibration.KernelSize("cpu-3", 0.0625, 300, 32, 32, 1)
     evaluate = sys.modules.get("ambiguous_wild.harness.evaluate")
     if evaluate is not None:
         evaluate.FPS_SECONDS = 0.05  # two seconds a run, which say nothing here

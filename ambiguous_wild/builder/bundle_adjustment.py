@@ -31,7 +31,7 @@ def plausible_distortion(model: Any) -> bool:
 
 
 def has_parallax(model: Any) -> bool:
-    """Tell whether photos saw points from apart; a camera that only turned gives points at any depth."""
+    """Tell whether points were seen under enough parallax; pure rotation gives points at any depth."""
     centres = {k: model.images[k].projection_center() for k in model.reg_image_ids()}
     points = list(model.points3D.values())
     angles = []
@@ -44,7 +44,7 @@ def has_parallax(model: Any) -> bool:
 
 
 def bundle_adjustment_options(distorted: bool, photos: int, *, final: bool) -> Any:
-    """Return options of a joint adjustment on one thread in which an outlier counts little."""
+    """Return options of a bundle adjustment on one thread with a robust loss."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params = distorted
     options.print_summary = False

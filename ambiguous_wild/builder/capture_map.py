@@ -347,13 +347,13 @@ def _with_links(drawn: CaptureMap, links: Sequence[Link]) -> CaptureMap:
         for a, b, matches in links
         if (a, b) in strongest | wanted
     ]
-    asked = sorted((m, a, b) for a, b, m in links if (a, b) in wanted)
+    to_strengthen = sorted((m, a, b) for a, b, m in links if (a, b) in wanted)
     return replace(
         drawn,
         photos=[replace(photo, weak=k in weak_photos) for k, photo in enumerate(photos)],
         links=shown,
-        stars=[_middle(photos[a], photos[b]) for _, a, b in asked],
-        advice=[_between(photos[a], photos[b]) for _, a, b in asked],
+        stars=[_middle(photos[a], photos[b]) for _, a, b in to_strengthen],
+        advice=[_between(photos[a], photos[b]) for _, a, b in to_strengthen],
     )
 
 

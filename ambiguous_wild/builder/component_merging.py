@@ -93,8 +93,8 @@ class ImpliedRotation:
     """The rotation between two components that a relative pose of a pair across them implies."""
 
     pair: Pair
-    here: int  # photo of the first component
-    there: int  # photo of the second component
+    first_photo: int  # of the first component
+    second_photo: int  # of the second component
     rotation: np.ndarray  # [3, 3] first from second
     direction: np.ndarray  # [3] from the first photo to the second, in the first component
 
@@ -107,16 +107,26 @@ def _implied_rotations(first: Registration, second: Registration) -> list[Implie
     for pair, relative_poses in strongest:
         if len({row.pair for row in rows}) >= MAX_PAIRS:
             break
-        for here, there in (pair, pair[::-1]):
-            if here not in first.poses or there not in second.poses or {here, there} <= first.poses.keys():
+        for photo_a, photo_b in (pair, pair[::-1]):
+            if (
+                photo_a not in first.poses
+                or photo_b not in second.poses
+                or {photo_a, photo_b} <= first.poses.keys()
+            ):
                 continue
-            mine, theirs = first.poses[here][:, :3], second.poses[there][:, :3]
+            rotation_a, rotation_b = first.poses[photo_a][:, :3], second.poses[photo_b][:, :3]
             for relative_pose in relative_poses:
                 for rotation, shift in zip(relative_pose.rotations, relative_pose.translations):
-                    centre = -rotation.T @ shift if here == pair[0] else shift
-                    relative = rotation if here == pair[0] else rotation.T  # there from here
+                    centre = -rotation.T @ shift if photo_a == pair[0] else shift
+                    relative = rotation if photo_a == pair[0] else rotation.T  # photo_b from photo_a
                     rows.append(
-                        ImpliedRotation(pair, here, there, mine.T @ relative.T @ theirs, mine.T @ centre)
+                        ImpliedRotation(
+                            pair,
+                            photo_a,
+                            photo_b,
+                            rotation_a.T @ relative.T @ rotation_b,
+                            rotation_a.T @ centre,
+                        )
                     )
     return rows
 
@@ -150,7 +160,7 @@ def _similarities_from_pairs(
     known: set[frozenset[tuple[int, int]]] = set()
     for which in same:
         alike = [row for row, use in zip(across, which) if use]
-        ends = frozenset((row.here, row.there) for row in alike)
+        ends = frozenset((row.first_photo, row.second_photo) for row in alike)
         if len(ends) < MIN_MERGE_PAIRS or ends in known:
             continue
         known.add(ends)
@@ -160,8 +170,8 @@ def _similarities_from_pairs(
         rows, values = [], []
         for row in alike:
             ray = np.cross(np.eye(3), row.direction).T  # ray @ v = cross(direction, v)
-            rows.append(np.column_stack([ray @ rotation @ centre_of(second.poses[row.there]), ray]))
-            values.append(ray @ centre_of(first.poses[row.here]))
+            rows.append(np.column_stack([ray @ rotation @ centre_of(second.poses[row.second_photo]), ray]))
+            values.append(ray @ centre_of(first.poses[row.first_photo]))
         system = np.concatenate(rows) * [1 / second.radius, 1.0, 1.0, 1.0]
         scale, *shift = np.linalg.lstsq(system, np.concatenate(values), rcond=None)[0]
         singular_values = np.linalg.svd(system, compute_uv=False)
@@ -171,13 +181,21 @@ def _similarities_from_pairs(
 
 def _similarities_from_photos(first: Registration, second: Registration) -> Iterator[Similarity]:
     """Yield the similarity that each pose of a photo in both components implies."""
-    here, there = PointLookup.read(first.matched, first.model), PointLookup.read(second.matched, second.model)
+    first_points, second_points = (
+        PointLookup.read(first.matched, first.model),
+        PointLookup.read(second.matched, second.model),
+    )
     for photo in sorted({*first.poses, *second.poses}):
-        mine = [first.poses[photo]] if photo in first.poses else first.resections(photo, here)
-        theirs = [second.poses[photo]] if photo in second.poses else second.resections(photo, there)
-        depths = _depths(photo, mine, first, here), _depths(photo, theirs, second, there)
-        for pose, near in zip(mine, depths[0]):
-            for other, far in zip(theirs, depths[1]):
+        first_poses = [first.poses[photo]] if photo in first.poses else first.resections(photo, first_points)
+        second_poses = (
+            [second.poses[photo]] if photo in second.poses else second.resections(photo, second_points)
+        )
+        depths = (
+            _depths(photo, first_poses, first, first_points),
+            _depths(photo, second_poses, second, second_points),
+        )
+        for pose, near in zip(first_poses, depths[0]):
+            for other, far in zip(second_poses, depths[1]):
                 both = sorted(near.keys() & far.keys())
                 if len(both) < MIN_DEPTHS:
                     continue

@@ -1,4 +1,4 @@
-"""A pose that a photo may have, the evidence for it, and what is asked of it."""
+"""Pose hypotheses: their evidence, and the conditions for accepting one."""
 
 from __future__ import annotations
 

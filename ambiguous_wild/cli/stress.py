@@ -125,7 +125,10 @@ def _replay(run: Path) -> None:
     prepare_cpu(None)
     result = replay_run(run)
     say(f"reported: {result.reported}", out=True)
-    say(f"replayed from iteration {result.started_at}: {result.found or 'all values are finite'}", out=True)
-    if not result.same:
+    say(
+        f"replayed from iteration {result.started_at}: {result.reproduced or 'all values are finite'}",
+        out=True,
+    )
+    if not result.matches:
         say("the replay differs from the report: check the version, the machine and the plugins")
         sys.exit(1)

@@ -80,7 +80,7 @@ def environment(device: str) -> Environment:
         "device": device,
         "packages": {name: installed(name) for name in PACKAGES},
     }
-    if revision := commit():
+    if revision := package_commit():
         facts["commit"] = revision
     if device.startswith("cuda"):
         from ambiguous_wild.splat.gsplat_calls import max_alpha
@@ -310,7 +310,7 @@ def provenance(cell: Cell) -> Provenance:
     return {
         "environment": environment(cell.device),
         "code_hash": code_hash(),
-        "reproduce": reproduce(cell),
+        "reproduce": reproduce_command(cell),
     }
 
 
@@ -326,12 +326,12 @@ def code_hash() -> str:
 
 
 @cache
-def commit() -> str:
+def package_commit() -> str:
     """Return the commit of the package, see `own_commit`; asked once a process."""
     return own_commit()
 
 
-def reproduce(cell: Cell) -> str:
+def reproduce_command(cell: Cell) -> str:
     """Return the command that makes this result again, whatever the defaults of a later version are.
 
     It names no output folder (-o, by default runs/).
@@ -391,11 +391,11 @@ def _plugins(method: MethodEntry) -> list[Path]:
     methods = all_methods()
     members = [methods[name] for _, name in method.slots if name in methods] or [method]
     # a reference is no plugin: its file need not call register
-    files = [file_of(member) for member in members if not member.given_as]
+    files = [method_file(member) for member in members if not member.given_as]
     return [path for path in dict.fromkeys(files) if path is not None]
 
 
-def file_of(method: MethodEntry) -> Path | None:
+def method_file(method: MethodEntry) -> Path | None:
     """Return the file of a user's own method; None for every other."""
     if method.given_as:
         return reference_file(method.given_as)

@@ -67,7 +67,7 @@ def mixed_tests(scene: Scene) -> str:
 
 @dataclass(frozen=True)
 class ChosenEffects:
-    """The effects of one run, and the request and plan that they come from."""
+    """The effects of one run, with the request and the plan behind them."""
 
     effects: tuple[str, ...] = ()
     asked: str = ""  # empty: no effects were asked for, and no effects.json is written

@@ -123,7 +123,7 @@ def kernel_threads() -> Iterator[int]:
 
 
 def trained_renderer(trainer: Trainer, half: bool) -> Draw:
-    """Return how a trained model draws test views.
+    """Return the function that renders test views of a trained model.
 
     `half`: colour effects are fitted on the left half of the photo, columns 0 to ceil(W / 2); nothing else is
     changed.

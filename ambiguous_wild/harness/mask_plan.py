@@ -270,7 +270,7 @@ def sample_photos(scene: Scene) -> tuple[Scene, list[int]]:
 
 
 def without_blocks(scene: Scene, blocks: Sequence[Tensor]) -> SparsePoints:
-    """Return the points without observations in held-out pixels, from whose colours effects would start."""
+    """Return the points without observations in held-out pixels, which would leak to effects."""
     points, views = scene.points, scene.points.track_views.copy()
     train = [index for index, view in enumerate(scene.views) if view.split == "train"]
     for index, block in zip(train, blocks):
@@ -284,7 +284,7 @@ def without_blocks(scene: Scene, blocks: Sequence[Tensor]) -> SparsePoints:
 
 
 class MaskComparison:
-    """The photos and blocks of one scene, on which the two trainings are compared."""
+    """Compares trainings with and without masks on held-out blocks of one scene."""
 
     def __init__(self, scene: Scene, folder: Path) -> None:
         """
@@ -323,7 +323,7 @@ class MaskComparison:
         """
         policy = HeldOutBlocks(self.blocks, patches, masked)
         # "images" sets both pictures to zero in the blocks, so that no window of SSIM uses them
-        hooks = MethodHooks(given=self.first, mask=policy, density_config=FIXED, weighting="images")
+        hooks = MethodHooks(user_start=self.first, mask=policy, density_config=FIXED, weighting="images")
         config = TrainConfig(iterations=iterations, seed=SEED, probes=0, checkpoint_every_s=1e9)
         trainer = Trainer(self.data, with_effects(hooks, effects), config, folder=self.folder)
         train(trainer, tick=lambda _: tick())
@@ -336,14 +336,14 @@ Bar = Callable[..., AbstractContextManager[Any]]
 
 @dataclass(frozen=True)
 class MaskingGain:
-    """The gain of leaving patches out, on the held-out pixels of the same photos."""
+    """PSNR that masking the patches gains on held-out pixels of the same photos."""
 
     db: float  # mean over photos
     error_db: float  # standard error of that mean
 
 
 def masking_gain(with_it: Mapping[str, float], without: Mapping[str, float]) -> MaskingGain | None:
-    """Return the gain photo by photo; None if the two share too few photos."""
+    """Return the mean gain over photos; None if the trainings share too few photos."""
     difference = np.array([with_it[name] - without[name] for name in without if name in with_it])
     if len(difference) < MIN_PHOTOS:
         return None

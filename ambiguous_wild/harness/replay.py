@@ -1,4 +1,4 @@
-"""Bring the trainer of a run back: after its last step, or where a value was not finite."""
+"""Restore the trainer of a run: after its last step, or where a value was not finite."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class Replay:
     """The finding that the run reported, and the one of the replay."""
 
     reported: str
-    found: str  # "" = the replay met no such value
+    reproduced: str  # "" = the replay met no such value
     started_at: int  # iteration
 
     @property
-    def same(self) -> bool:
-        return self.reported == self.found
+    def matches(self) -> bool:
+        return self.reported == self.reproduced
 
 
 def replay_run(run: Path) -> Replay:

@@ -57,7 +57,7 @@ def start_file(path: Path) -> StartFile:
 
 
 def with_start(hooks: MethodHooks, start: StartFile | None, scene: Scene) -> MethodHooks:
-    """Return the hooks of a method with the content of the file to start from.
+    """Return the hooks of a method that starts from the file.
 
     Raises:
         AwError: the file has changed, or its content does not lie where the scene is.
@@ -72,10 +72,10 @@ def with_start(hooks: MethodHooks, start: StartFile | None, scene: Scene) -> Met
     if isinstance(content, SplatFile):
         arrays = moved(content.gaussians, content.transform, transform)
         _check_position(start.path, arrays["means"], scene)
-        return replace(hooks, given=gaussians_of(arrays))
+        return replace(hooks, user_start=gaussians_of(arrays))
     xyz = (content[0] - transform.centre) * transform.scale
     _check_position(start.path, xyz, scene)
-    return replace(hooks, given=(xyz, content[1]))
+    return replace(hooks, user_start=(xyz, content[1]))
 
 
 def start_line(start: StartFile, method: str, hooks: MethodHooks, train: TrainConfig, scene: Scene) -> str:
@@ -120,10 +120,10 @@ def _check_position(path: Path, xyz: np.ndarray, scene: Scene) -> None:
     if max(shares) < _FEW_NEAR:
         middle = np.median(xyz, axis=0) / scene.transform.scale + scene.transform.centre
         coordinates = ", ".join(f"{c:.4g}" for c in middle)
-        found = (
+        message = (
             f"{path} lies around ({coordinates}), and at most {max(shares):.0%} of its points and those of "
             f"{scene.name} lie near each other"
         )
         if max(shares) < _MIN_NEAR:
-            raise AwError(f"{found}: give a file of this scene, in its coordinates")
-        warnings.warn(plain(f"{found}: is it of another scene?"), stacklevel=2)
+            raise AwError(f"{message}: give a file of this scene, in its coordinates")
+        warnings.warn(plain(f"{message}: is it of another scene?"), stacklevel=2)

@@ -193,9 +193,9 @@ def contradictions(config: ReadConfig, result: RunResult) -> Iterator[str]:
     }
     if config.get("effects") and result["status"] == "ok":  # a failure states none
         pairs["effects"] = config["effects"], facts.get("effects")
-    for what, (asked, got) in pairs.items():
-        if asked is not None and asked != got:
-            yield f"{what} is {str(asked)[:40]!a} in {CONFIG} and {str(got)[:40]!a} in {RESULT}"
+    for what, (configured, recorded) in pairs.items():
+        if configured is not None and configured != recorded:
+            yield f"{what} is {str(configured)[:40]!a} in {CONFIG} and {str(recorded)[:40]!a} in {RESULT}"
 
 
 def start_hash(facts: RunFacts) -> str:
@@ -210,9 +210,9 @@ def cost_contradictions(run: Path, result: RunResult, config: ReadConfig) -> Ite
         return
     if "gaussians" in cost and (run / MODEL).is_file() and cost["gaussians"] != splat_count(run / MODEL):
         yield f"{RESULT} has {cost['gaussians']} Gaussians, {MODEL} {splat_count(run / MODEL)}"
-    steps, asked = cost.get("iterations"), train.get("iterations")
-    if steps is not None and isinstance(asked, int) and not train.get("budget_s") and steps < asked:
-        yield f"{RESULT} has {steps} iterations, {CONFIG} asks for {asked}"
+    steps, configured = cost.get("iterations"), train.get("iterations")
+    if steps is not None and isinstance(configured, int) and not train.get("budget_s") and steps < configured:
+        yield f"{RESULT} has {steps} iterations, {CONFIG} asks for {configured}"
 
 
 def impossible_values(result: RunResult) -> Iterator[tuple[str, float, str]]:

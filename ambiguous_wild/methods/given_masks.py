@@ -1,4 +1,4 @@
-"""Mask policies of other sources: fixed masks of a first pass, or masks and losses of two methods."""
+"""Fixed masks of a first pass, and policies grafted from masks and losses of two methods."""
 
 from __future__ import annotations
 

@@ -190,7 +190,7 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Method
         return host
     effects = donors["effects"].hooks.effects
     for effect in effects:
-        host = host.suited_to(effect)
+        host = host.with_effect(effect)
     return dataclasses.replace(host, effects=effects)
 
 

@@ -39,7 +39,7 @@ from ambiguous_wild.splat.effects.geometry import (
     conv_leaves,
     directions,
     frequencies,
-    mean_of_seen,
+    mean_of_visible,
     projected,
     with_penalty,
 )
@@ -206,7 +206,7 @@ class GswAppearance(AutogradEffect):
         colours = 0.5 + mlp(torch.cat([hidden, directions(means, context.camera)], dim=1), leaf, "head")
         if self.config.residual:
             colours = colours + SH_C0 * intrinsic[:, :3]
-        beyond = mean_of_seen(F.relu(places.abs() - 1.0), means, context.camera)
+        beyond = mean_of_visible(F.relu(places.abs() - 1.0), means, context.camera)
         return with_penalty(colours, self.config.outside * beyond)
 
     def _seen(self, context: ViewContext) -> Tensor | None:

@@ -18,7 +18,7 @@ from torch import Tensor
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.absgs import AbsoluteGradientSums
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, top_k_mask
-from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes, widened
+from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes, filtered_variances
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
@@ -47,7 +47,7 @@ def build(options: MipConfig) -> MethodHooks:
 
 def opacity_factor(log_scales: Tensor, size: Tensor) -> Tensor:
     """Return the factor [N] of opacities under a filter of size f [N]: sqrt(prod s^2 / prod (s^2 + f^2))."""
-    return widened(log_scales, size)[1].prod(dim=1).sqrt()
+    return filtered_variances(log_scales, size)[1].prod(dim=1).sqrt()
 
 
 class MipDensity(DensityControl):

@@ -239,7 +239,7 @@ class RenderedUncertainty(EffectMask, CountingMask, WarmUpMask):
 
 
 def confident_pixels(weight: Tensor) -> Tensor:
-    """Keep pixels with a weight above 1; a photo without such a pixel is kept whole, or nothing is learnt."""
+    """Keep pixels with a weight above 1; a photo without such pixels is kept whole."""
     static = weight > 1.0
     return torch.where(static.any(), static, True).float()
 

@@ -110,7 +110,7 @@ def _has(folder: Path, module: str) -> bool:
 
 def _imported_later(path: Path, folder: Path) -> set[Path]:
     """Return the files below a folder that a file, or one of these, names in an import, also in functions."""
-    found: set[Path] = set()
+    imported: set[Path] = set()
     waiting = [path]
     while waiting:
         try:
@@ -125,10 +125,10 @@ def _imported_later(path: Path, folder: Path) -> set[Path]:
         names |= {f"{node.module}.{alias.name}" for node in froms for alias in node.names}
         for place in (folder.joinpath(*name.split(".")) for name in names):
             for file in (place.with_suffix(".py"), place / "__init__.py"):
-                if file.is_file() and file != path and file not in found:
-                    found.add(file)
+                if file.is_file() and file != path and file not in imported:
+                    imported.add(file)
                     waiting.append(file)
-    return found
+    return imported
 
 
 def _file_of(name: str) -> Path | None:

@@ -31,7 +31,7 @@ from ambiguous_wild.splat.effects.autograd_effect import (
     mlp,
     mlp_leaves,
 )
-from ambiguous_wild.splat.effects.geometry import SceneNormaliser, in_picture, mean_of_seen, with_penalty
+from ambiguous_wild.splat.effects.geometry import SceneNormaliser, in_picture, mean_of_visible, with_penalty
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import TrainData, ViewContext
@@ -240,7 +240,7 @@ class GatedColours(AutogradEffect):
         opacity = (torch.sigmoid(logits[seen]) * (1.0 - z)).clamp(MIN_OPACITY, 1.0 - 1e-6)
         opened = logits.clone()
         opened[seen] = torch.logit(opacity)
-        gate = mean_of_seen(z, means[seen], context.camera)
+        gate = mean_of_visible(z, means[seen], context.camera)
         return {"opacity_logits": with_penalty(opened, self.config.off * gate)}
 
     @torch.no_grad()

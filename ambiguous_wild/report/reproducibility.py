@@ -16,7 +16,7 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.core.names import plain
-from ambiguous_wild.harness.cell import code_hash, commit
+from ambiguous_wild.harness.cell import code_hash, package_commit
 from ambiguous_wild.harness.command_lines import length_text
 from ambiguous_wild.harness.result_file import Environment, RunConfig, RunResult
 from ambiguous_wild.harness.store import checked_result, config_section, effects_of, find_runs, read_config
@@ -157,7 +157,7 @@ def _code(runs: Sequence[_Run]) -> list[str]:
 def _version(run: _Run) -> str:
     code = str(run.result.get("code_hash", ""))
     # a result of an earlier version names no commit; if its code is the present one, so is its commit
-    of = run.environment.get("commit") or (commit() if code and code == code_hash() else "")
+    of = run.environment.get("commit") or (package_commit() if code and code == code_hash() else "")
     parts = [f"commit {of}"] if of else []
     parts += [f"code {code[:HASH]}"] if code else []
     return run.result["version"] + (f" ({', '.join(parts)})" if parts else "")

@@ -1,4 +1,4 @@
-"""What is done with kernels before a run: compile them once a machine, and time a fixed piece of training.
+"""Compile kernels before a run, once per machine, and time a fixed piece of training.
 
 The timed kernel, blending and Adam, tells how fast the machine is now. It runs the trainer's own code with
 the trainer's threads, so that other programs slow it down as they slow down a training. Its scene never

@@ -331,7 +331,7 @@ class DensityControl:
 
 
 def top_k_mask(score: Tensor, chosen: Tensor, room: int) -> Tensor:
-    """Return those `room` of the chosen rows that have the largest score, [N] bool."""
+    """Return the `room` chosen rows with the largest score, [N] bool."""
     if int(chosen.sum()) <= room:
         return chosen
     # stable sort: ties are broken by row, so the same seed gives the same set
@@ -344,6 +344,6 @@ def top_k_mask(score: Tensor, chosen: Tensor, room: int) -> Tensor:
 
 
 def covariance_offsets(noise: Tensor, gaussians: Gaussians) -> Tensor:
-    """Turn normal draws [N, 3] into offsets from the means [N, 3] with the Gaussians' covariances."""
+    """Transform normal draws [N, 3] to offsets [N, 3] with the Gaussians' covariances."""
     local = noise * gaussians.log_scales.exp()
     return (rotation_matrices(gaussians.quats) @ local[:, :, None]).squeeze(2)

@@ -23,7 +23,7 @@ from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.gpu_kernels import visible
 from ambiguous_wild.splat.rendered import (
     GSPLAT_SUMS,
-    NOTHING,
+    NO_STATISTICS,
     Cotangents,
     Gradients,
     Shade,
@@ -99,7 +99,7 @@ class RenderedCuda:
         return self._depth
 
     @torch.no_grad()
-    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
+    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NO_STATISTICS) -> Gradients:
         """Do as `Rendered.backward`, but only once for a picture, because torch frees its graph.
 
         Absolute sums do not contain depth, which gsplat blends separately.

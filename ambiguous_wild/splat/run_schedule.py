@@ -1,4 +1,4 @@
-"""What a run does when: its progress, the next view, and the resolution and learning rates of each step.
+"""Schedules of a run: its progress, the next view, resolution and learning rates of each step.
 
 How small the training photos may be at each point of a short run is DashGaussian's rule (arXiv 2503.18402):
 the resolution follows the share of the photos' spectrum that has been learnt. It reads the frequencies of the

@@ -22,7 +22,7 @@ from ambiguous_wild.splat.data import PhotoPyramid, shrink_keep
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.drawing import SceneRenderer
 from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
-from ambiguous_wild.splat.field import Field, rates_with
+from ambiguous_wild.splat.field import Field, rates_with_attributes
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import PhotometricLoss, photometric
 from ambiguous_wild.splat.method_hooks import MethodHooks, check_cotangents, check_keep
@@ -103,11 +103,13 @@ class Trainer:
         self.effects = EffectPipeline(hooks.effects, data)
         attributes = self.effects.rows(gaussians)
         if attributes:
-            gaussians = gaussians.carrying({name: a.values for name, a in attributes.items()})
+            gaussians = gaussians.with_attributes({name: a.values for name, a in attributes.items()})
         density = hooks.density(hooks.density_config, data.scene.extent, config.seed)
         density.setup(data)
         density.protected = self.effects.protected()
-        self.field = Field(gaussians, rates_with(attributes, self.run_schedule.learning_rates), density)
+        self.field = Field(
+            gaussians, rates_with_attributes(attributes, self.run_schedule.learning_rates), density
+        )
         self.drawing = SceneRenderer(data, hooks, self.field, self.effects)
         hooks.mask.setup(data)
 
@@ -306,7 +308,7 @@ class Trainer:
             growth_cap=self.run_schedule.growth_cap(downsampling, progress),
             rendered=rendered,
             gaussians=self.gaussians,
-            drawer=self.drawing.again,
+            drawer=self.drawing.draw_again,
         )
 
     def _photometric(self, step: Step, keep: Tensor | None) -> PhotometricLoss:

@@ -23,7 +23,7 @@ class Stopped(KeyboardInterrupt):
 
 
 @contextmanager
-def deferred() -> Iterator[Callable[[], bool]]:
+def defer_interrupt() -> Iterator[Callable[[], bool]]:
     """Defer Ctrl-C inside of the context; yields a function that tells whether it was pressed.
 
     A second Ctrl-C interrupts at once. Outside of the main thread, or if another handler is installed for the
@@ -67,7 +67,7 @@ def train(trainer: Trainer, tick: Tick | None = None) -> None:
         meter.begin(trainer.clock.now())
     last_save = time.monotonic()
     try:
-        with deferred() as interrupted:
+        with defer_interrupt() as interrupted:
             while not (trainer.done and _save_if_finite(trainer)):
                 if trainer.done:
                     continue  # the run was rolled back, and its last checkpoint is checked
@@ -139,7 +139,7 @@ def _roll_back(trainer: Trainer, error: NonFinite) -> None:
     watchdog = trainer.watchdog
     where = watchdog.snapshot(trainer.checkpoint_path, error)
     if not watchdog.rolls_back:
-        raise watchdog.final(error, where)
+        raise watchdog.final_error(error, where)
     spent, rollbacks = trainer.clock, list(watchdog.rollbacks)
     trainer.resume()
     trainer.clock = spent

@@ -1,4 +1,4 @@
-"""What a run records: training time, the timeline, and where density control added and merged Gaussians."""
+"""Records of a run: training time, timeline, positions of added and merged Gaussians."""
 
 from __future__ import annotations
 

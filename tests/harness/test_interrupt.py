@@ -14,7 +14,7 @@ from ambiguous_wild.harness.benchmark import Callbacks, bench
 from ambiguous_wild.harness.store import run_folders
 from ambiguous_wild.harness.trained_models import find_run_models
 from ambiguous_wild.io.ply import read_splat_ply
-from ambiguous_wild.splat.training_loop import Stopped, deferred
+from ambiguous_wild.splat.training_loop import Stopped, defer_interrupt
 from tests.tiny_scene import write_tiny_scene
 
 LENGTH = 30
@@ -108,13 +108,13 @@ def test_only_the_main_thread_and_the_default_answer_are_touched() -> None:
 
     before = signal.signal(signal.SIGINT, other)
     try:
-        with deferred() as interrupted:
+        with defer_interrupt() as interrupted:
             assert signal.getsignal(signal.SIGINT) is other and not interrupted()
     finally:
         signal.signal(signal.SIGINT, before)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with deferred() as interrupted:
+        with defer_interrupt() as interrupted:
             signal.raise_signal(signal.SIGINT)
             assert interrupted()
             with pytest.raises(KeyboardInterrupt):

@@ -52,7 +52,7 @@ def test_the_same_value_is_found_again_and_the_run_is_left_alone(run):
     assert "aw stress --replay" in report.error
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     again = replay_run(folder)
-    assert again.same
+    assert again.matches
     assert again.started_at == 0
     assert before == {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     done = CliRunner().invoke(cli, ["stress", "--replay", str(folder)])
@@ -92,7 +92,7 @@ def test_a_parameter_found_before_saving_is_found_again(run):
     assert report.outcome == "failed"
     assert "parameter of log_scales" in report.error
     again = replay_run(folder)
-    assert again.same, again
+    assert again.matches, again
 
 
 @pytest.fixture(scope="module")

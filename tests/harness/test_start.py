@@ -12,7 +12,7 @@ import pytest
 from ambiguous_wild import bench
 from ambiguous_wild.core import AwError, SparsePoints
 from ambiguous_wild.harness.benchmark import Callbacks
-from ambiguous_wild.harness.cell import RunOptions, reproduce
+from ambiguous_wild.harness.cell import RunOptions, reproduce_command
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.harness.job import make_cell, make_job
 from ambiguous_wild.harness.start import start_file, with_start
@@ -89,7 +89,7 @@ def test_a_start_is_in_the_coordinates_of_the_files(tmp_path, kind, shift, scale
     arrays = {**wall, "means": inner.astype(np.float32), "log_scales": sizes}
     if kind == "points":
         write_point_ply(path, true, np.zeros((2500, 3), np.uint8))
-        xyz, _ = with_start(MethodHooks(), start_file(path), scene).given
+        xyz, _ = with_start(MethodHooks(), start_file(path), scene).user_start
         np.testing.assert_allclose(xyz, inner, atol=1e-3)
         return
     write_splats(FORMATS[kind], path, arrays, scene.transform)
@@ -109,7 +109,7 @@ def test_a_start_travels_with_its_cell_and_a_file_that_changed_is_refused(scene,
     (cell,) = plan_cells(["3dgs"], [scene], [0], TrainConfig(iterations=3), start=dense)
     there = make_cell(make_job(cell, tmp_path / "run", RunOptions(tmp_path)))
     assert there.start == cell.start and there.identity == cell.identity
-    assert f"--start {dense}" in reproduce(cell)
+    assert f"--start {dense}" in reproduce_command(cell)
     wall_points(dense, 901)
     with pytest.raises(AwError, match="has changed since"):
         with_start(MethodHooks(), cell.start, cell.scene)
@@ -146,12 +146,12 @@ def test_a_start_may_cover_a_part_of_the_scene_alone(scene, tmp_path):
     wall = wall_model(900)["means"]
     part = wall[wall[:, 0] < -1.5]
     write_point_ply(tmp_path / "part.ply", part, np.zeros(part.shape, np.uint8))
-    xyz, _ = with_start(MethodHooks(), start_file(tmp_path / "part.ply"), load_scene(scene)).given
+    xyz, _ = with_start(MethodHooks(), start_file(tmp_path / "part.ply"), load_scene(scene)).user_start
     assert 4 < len(xyz) < 300
 
 
 def test_a_start_is_not_compared_with_the_few_dummy_points_of_a_scene(scene, tmp_path):
     given = load_scene(scene)
     dummy = replace(given, points=SparsePoints.without_tracks(np.full((1, 3), -50.0)))
-    xyz, _ = with_start(MethodHooks(), start_file(wall_points(tmp_path / "wall.ply", 900)), dummy).given
+    xyz, _ = with_start(MethodHooks(), start_file(wall_points(tmp_path / "wall.ply", 900)), dummy).user_start
     assert len(xyz) == 900

@@ -18,7 +18,7 @@ from ambiguous_wild.splat.effects.geometry import (
     frequencies,
     harmonics,
     in_picture,
-    mean_of_seen,
+    mean_of_visible,
     projected,
     ray_directions,
     with_penalty,
@@ -356,10 +356,10 @@ def test_means_over_what_is_seen_are_the_same_on_an_accelerator(swag, monkeypatc
     view = replace(view, fx=4 * view.fx, fy=4 * view.fy)  # sees a part
     seen, values = in_picture(g.means, view), random(len(g), 2)
     assert 0 < int(seen.sum()) < len(g)
-    on_cpu = mean_of_seen(values[seen], g.means[seen], view)
+    on_cpu = mean_of_visible(values[seen], g.means[seen], view)
     monkeypatch.setattr("ambiguous_wild.splat.backend.accelerated", lambda device: True)
-    torch.testing.assert_close(mean_of_seen(values, g.means, view), on_cpu)
-    torch.testing.assert_close(mean_of_seen(values[:, 0], g.means, view), values[seen, 0].mean())
+    torch.testing.assert_close(mean_of_visible(values, g.means, view), on_cpu)
+    torch.testing.assert_close(mean_of_visible(values[:, 0], g.means, view), values[seen, 0].mean())
 
 
 def test_gates_close_by_their_logit_and_only_in_photos(swag):

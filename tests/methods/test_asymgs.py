@@ -30,7 +30,7 @@ def seen(scene, tmp_path_factory):
 
 def averaged(g):
     effect = ParameterEma(0.8)
-    return effect, g.carrying({name: row.values for name, row in effect.rows(g).items()})
+    return effect, g.with_attributes({name: row.values for name, row in effect.rows(g).items()})
 
 
 def test_the_average_by_hand():

@@ -21,7 +21,7 @@ ROUND = McmcConfig(start=1.0, every=1.0, min_every=1, noise=0.0, apart=0.0)  # a
 
 def some(n=40):
     """Gaussians that carry their number, of which the first five are dead."""
-    g = gaussians(n=n, rest=3).carrying({"tag": torch.arange(float(n))})
+    g = gaussians(n=n, rest=3).with_attributes({"tag": torch.arange(float(n))})
     g.opacity_logits[:5] = -9.0
     return g
 
@@ -79,7 +79,7 @@ def test_the_dead_move_and_the_number_grows_by_a_share():
 
 @pytest.mark.parametrize("dead", [0, 1500])
 def test_copies_start_at_draws_of_their_source(dead):
-    g = gaussians(n=1, rest=3).carrying({"tag": torch.zeros(1)})
+    g = gaussians(n=1, rest=3).with_attributes({"tag": torch.zeros(1)})
     for tensor, value in ((g.means, 0.0), (g.quats, 0.0), (g.opacity_logits, 3.0)):
         tensor.fill_(value)
     g.quats[:, 0] = g.quats[:, 3] = 0.5**0.5  # a quarter turn around z: x becomes y

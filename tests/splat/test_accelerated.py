@@ -99,7 +99,7 @@ def test_the_step_that_broke_is_made_again_with_its_own_keep_map(scene, tmp_path
         for _ in range(12):
             trainer.step()
     assert mask.calls == 24  # nobody asks the policy again
-    keep = info.value.seen["keep"]
+    keep = info.value.tensors["keep"]
     expected = torch.full_like(keep, 1.0 / 13)  # of its call in step 7
     if where == "keep":
         expected[20, 30] = math.nan

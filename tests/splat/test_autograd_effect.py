@@ -81,7 +81,9 @@ def test_all_three_places_against_finite_differences(scene, tmp_path):
     effect.setup(data)
     g = gaussians(4, n=25, size=-0.5)
     g.opacity_logits.clamp_(-1.5, 1.5)
-    g = g.carrying({"code": torch.tensor(np.random.default_rng(1).normal(size=(25, 3)), dtype=torch.float32)})
+    g = g.with_attributes(
+        {"code": torch.tensor(np.random.default_rng(1).normal(size=(25, 3)), dtype=torch.float32)}
+    )
     weight = torch.tensor(np.random.default_rng(2).normal(size=(29, 37, 3)), dtype=torch.float32)
     rendered = drawn_with(effect, g)
     found = rendered.backward(weight)

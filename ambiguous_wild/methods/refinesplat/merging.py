@@ -83,7 +83,7 @@ def merge_pairs(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -
     rows = torch.nonzero(candidates).squeeze(1)
     if len(rows) < 2:
         return rows.new_zeros((0, 2))
-    chosen = gaussians.of_degree(0).select(rows)  # higher harmonics are not compared
+    chosen = gaussians.with_sh_degree(0).select(rows)  # higher harmonics are not compared
     # many centres coincide after cloning: a point itself may not be among its neighbours
     near = backend_of(rows.device).neighbours(chosen.means, min(config.neighbours + 1, len(rows)))
     i = torch.arange(len(rows), device=rows.device)[:, None].expand_as(near)

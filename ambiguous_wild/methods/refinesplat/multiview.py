@@ -266,13 +266,13 @@ class MultiViewStore:
         evidence, same = np.empty((n, h, w), np.float32), np.empty((n, h, w), np.bool_)
         difference, offset = np.empty((n, h, w, 3), np.float32), np.zeros((n, 3), np.float32)
         counts, out = np.zeros((n, 3, COLOURS), np.int64), np.empty((3, h, w), np.float32)
-        found = evidence, same, difference, offset
-        look_up(*rays, depth.numpy(), near, view, evidences, colours, depths, shares, rules, counts, *found)
+        buffers = evidence, same, difference, offset
+        look_up(*rays, depth.numpy(), near, view, evidences, colours, depths, shares, rules, counts, *buffers)
         sparse_depth = self.sparse_depth[view]
         sparse = np.empty((0, 0), np.float32) if sparse_depth is None else sparse_depth.numpy()
         combine(
             *rays, sparse, near, view, evidences, colours, depths, surfaces, shares, surface_shares,
-            rules, least, self.ranks.pair.numpy(), self.ranks.share.numpy(), *found, out,
+            rules, least, self.ranks.pair.numpy(), self.ranks.share.numpy(), *buffers, out,
         )  # fmt: skip
         return torch.from_numpy(out)
 

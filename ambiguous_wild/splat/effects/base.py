@@ -1,4 +1,4 @@
-"""What an effect is: a change before or after the render call, with a backward pass of its own.
+"""Base of effects: changes before or after the render call, each with its own backward pass.
 
     camera -> [poses] -> model -> [appearance] -> [3D filter] -> render -> image -> [exposure]
 
@@ -123,12 +123,12 @@ class Effect:
 
 
 def identity_vjp(gradients: Gradients) -> Gradients:
-    """Return the gradients: the vjp of an unchanged model."""
+    """Return the gradients: vjp of a hook that changes no Gaussians."""
     return gradients
 
 
 def identity_frame_vjp(cotangents: Cotangents) -> Cotangents:
-    """Return the cotangents: the vjp of an unchanged picture."""
+    """Return the cotangents: vjp of a hook that changes no picture."""
     return cotangents
 
 

@@ -15,9 +15,13 @@ from ambiguous_wild.io.files import write_bytes
 from ambiguous_wild.io.gltf import decode_gltf, encode_gltf
 from ambiguous_wild.io.ply import decode_ply, encode_ply, has_chunks
 from ambiguous_wild.io.sog import decode_sog, encode_sog
-from ambiguous_wild.io.splat_arrays import Arrays, SplatFile, finite, morton_order
+from ambiguous_wild.io.splat_arrays import SH_C0, Arrays, SplatFile, finite, logit, morton_order
 from ambiguous_wild.io.spz import decode_spz, encode_spz
 from ambiguous_wild.io.untrusted import read_bytes
+
+_DOT_SPLAT = np.dtype(
+    [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]  # quats w, x, y, z
+)
 
 
 @dataclass(frozen=True)
@@ -72,22 +76,45 @@ FORMATS = {form.name: form for form in _ALL}
 
 
 def read_splats(path: Path) -> SplatFile:
-    """Read the Gaussians of a file in one of `FORMATS` whose values are all finite, at least one.
+    """Read those Gaussians of a file in one of `FORMATS`, or a `.splat`, whose values are all finite.
 
     Raises:
         AwError: no such file, another format, damaged, no Gaussian is finite, or one is too far for float32.
     """
     data = read_bytes(path)
     form = next((form for form in FORMATS.values() if form.starts(data)), None)
-    if form is None:
-        raise AwError(f"{path} is no splat file: {', '.join(f.suffix for f in FORMATS.values())} are read")
-    splats = form.decode(data, path)
+    if form is not None:
+        splats = form.decode(data, path)
+    elif path.suffix.lower() == ".splat":  # without a magic number
+        splats = _decode_dot_splat(data, path)
+    else:
+        suffixes = (*(f.suffix for f in FORMATS.values()), ".splat")
+        raise AwError(f"{path} is no splat file: {', '.join(suffixes)} are read")
     kept = finite(splats.gaussians)
     if not len(kept["means"]):
         raise AwError(f"{path} holds no Gaussian that is finite")
     if not (np.abs(kept["means"]) < LARGEST_COORDINATE).all():
         raise AwError(f"{path} holds a Gaussian with a coordinate above {LARGEST_COORDINATE:g}; remove it")
     return replace(splats, gaussians=kept, left_out=len(splats.gaussians["means"]) - len(kept["means"]))
+
+
+def _decode_dot_splat(data: bytes, path: Path) -> SplatFile:
+    """Read antimatter15's `.splat`, degree 0 (github.com/antimatter15/splat, convert.py)."""
+    if not data or len(data) % _DOT_SPLAT.itemsize:
+        size = _DOT_SPLAT.itemsize
+        raise AwError(f"{path}: {len(data)} bytes, not a multiple of {size} as in a .splat file: cut short?")
+    rows = np.frombuffer(data, _DOT_SPLAT)
+    with np.errstate(divide="ignore", invalid="ignore"):  # such rows are left out
+        log_scales = np.log(rows["scales"])
+    gaussians = {
+        "means": rows["means"].copy(),
+        "quats": (rows["quats"].astype(np.float32) - 128) / 128,
+        "log_scales": log_scales,
+        "opacity_logits": logit(rows["rgba"][:, 3] / 255),
+        "sh0": ((rows["rgba"][:, :3] / 255 - 0.5) / SH_C0).astype(np.float32),
+        "sh_rest": np.zeros((len(rows), 0, 3), np.float32),
+    }
+    return SplatFile(gaussians)
 
 
 def drawable(form: SplatFormat, gaussians: Arrays) -> dict[str, np.ndarray]:

@@ -422,7 +422,7 @@ class Trainer:
     ) -> Tensor:
         """Check the step on the device; returns [1] on the device, 1 = skip the optimiser's step."""
         assert self.device_check is not None
-        checked = list(self.watchdog.checked_gradients(gradients).values())
+        checked = self.watchdog.checked_gradients(gradients)
         value = torch.as_tensor(loss.value)
         self._downsampling[step.iteration] = step.downsampling
         return self.device_check.watch(step.iteration, step.view, value, checked, keep, method_cotangents)

@@ -4,8 +4,8 @@ The checks are cheap: one pass over the bits of the tensors; rows are searched o
 Gradients are checked in every step, before anything changes. Those of the higher harmonics (45 of a
 Gaussian's 59 floats) are not: they are the constant's times a polynomial of a unit vector, so what breaks
 them breaks the constant too. Parameters are checked every `EVERY` iterations, after growth and before every
-checkpoint, which checks other fields too: no checkpoint holds Gaussians that are not finite. Effects are not
-checked.
+checkpoint, which checks other fields too: no checkpoint holds Gaussians that are not finite. Of effects only
+the gradients are checked.
 
 On an accelerator the host does not know the result of a step until it waits for it. So the device keeps a
 flag that stays set, the number of finite steps before it, and the keep map and cotangents of the broken step
@@ -52,14 +52,15 @@ class NonFiniteFinding:
 
     what: Kind
     names: tuple[str, ...]  # tensors that hold it; empty for the loss
-    rows: tuple[int, ...]  # the first ten Gaussians with such a value
+    rows: tuple[int, ...]  # the first ten static Gaussians with such a value
     count: int  # number of these Gaussians
     iteration: int
     since: int  # first iteration that may have caused it; before `iteration` for parameters
     view: str  # file name of the photo
 
     def __str__(self) -> str:
-        which = f" of {', '.join(self.names)} in {self.count} Gaussians" if self.names else ""
+        which = f" of {', '.join(self.names)}" if self.names else ""
+        which += f" in {self.count} Gaussians" if self.count else ""
         when = f"iteration {self.iteration}"
         if self.since < self.iteration:
             when = f"one of the iterations {self.since} to {self.iteration}, the last"
@@ -103,18 +104,16 @@ class Watchdog:
 
         Adam would hide it: its kernel sets a moment that is NaN to 0, like one that is too small.
         """
-        named = self.checked_gradients(gradients)
-        if not _finite(named):
-            bad = _bad_rows(named)
-            if bad:
-                broken = {f"d_{name}": named[name] for name in bad}
-                raise self._finding(
-                    "gradient", step.iteration, step.view, bad, _seen(step, keep, loss) | broken
-                )
+        named = _of_gaussians(gradients)
+        bad = {} if _finite(named) else _bad_rows(named)
+        others = [name for name, d in _of_others(gradients) if not bool(torch.isfinite(d).all())]
+        if bad or others:
+            seen = _seen(step, keep, loss) | {f"d_{name}": named[name] for name in bad}
+            raise self._finding("gradient", step.iteration, step.view, bad, seen, others)
 
-    def checked_gradients(self, gradients: Gradients) -> dict[str, Tensor]:
+    def checked_gradients(self, gradients: Gradients) -> list[Tensor]:
         """Return the gradients that are checked in every step."""
-        return {name: getattr(gradients, name) for name in _CHECKED} | dict(gradients.attributes)
+        return [*_of_gaussians(gradients).values(), *(d for _, d in _of_others(gradients))]
 
     def nonreproducible(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> NonFinite:
         """Return the finding of a step that is finite when repeated: a GPU sums in another order."""
@@ -133,12 +132,18 @@ class Watchdog:
                 raise self._finding("parameter", iteration, view, bad, {"gaussians": named})
 
     def _finding(
-        self, what: Kind, iteration: int, view: int, bad: Mapping[str, Tensor], seen: State
+        self,
+        what: Kind,
+        iteration: int,
+        view: int,
+        bad: Mapping[str, Tensor],
+        seen: State,
+        others: Sequence[str] = (),  # names of tensors that are not of the static Gaussians
     ) -> NonFinite:
         rows = torch.stack(list(bad.values())).any(0).nonzero()[:, 0].tolist() if bad else []
         since = iteration - (iteration - 1) % self.every if what == "parameter" else iteration
         finding = NonFiniteFinding(
-            what, tuple(bad), tuple(rows[:10]), len(rows), iteration, since, self.photos[view]
+            what, (*bad, *others), tuple(rows[:10]), len(rows), iteration, since, self.photos[view]
         )
         return NonFinite(finding, view, seen)
 
@@ -224,6 +229,17 @@ class Watchdog:
     def load_state_dict(self, rollbacks: list[Facts]) -> None:
         self.rollbacks = list(rollbacks)
         self.every = 1 if rollbacks else EVERY
+
+
+def _of_gaussians(gradients: Gradients) -> dict[str, Tensor]:
+    return {name: getattr(gradients, name) for name in _CHECKED} | dict(gradients.attributes)
+
+
+def _of_others(gradients: Gradients) -> list[tuple[str, Tensor]]:
+    """Return the gradients of effects, as `effect.leaf`, and of other fields, as `field.means`."""
+    fields = ((name, _of_gaussians(g)) for name, g in gradients.fields.items())
+    groups = [*gradients.effect_grads.items(), *fields]
+    return [(f"{group}.{name}", d) for group, named in groups for name, d in named.items()]
 
 
 def _finite(named: Mapping[str, Tensor]) -> bool:

@@ -101,6 +101,28 @@ def test_what_another_program_wrote_is_read(ending: str) -> None:
     check_near(read(ending, THEIRS / f"model.{ending}"), given, LOOSE[ending])
 
 
+def dot_splat(given: Arrays) -> bytes:
+    """The bytes that antimatter15's convert.py writes, record by record."""
+    records = []
+    for k in range(len(given["means"])):
+        colour = [*(0.5 + SH_C0 * given["sh0"][k]), alpha(given["opacity_logits"][k])]
+        turned = given["quats"][k] / np.linalg.norm(given["quats"][k]) * 128 + 128
+        records += [given["means"][k].tobytes(), np.exp(given["log_scales"][k]).tobytes()]
+        records += [(255 * np.array(colour)).clip(0, 255).astype(np.uint8).tobytes()]
+        records += [turned.clip(0, 255).astype(np.uint8).tobytes()]
+    return b"".join(records)
+
+
+def test_dot_splat_is_read_by_its_name(tmp_path: Path) -> None:
+    given = model(300, rest=0)
+    given["sh0"] = given["sh0"].clip(-1.7, 1.7)  # colours in [0, 1]; others are clipped
+    (tmp_path / "a.SPLAT").write_bytes(dot_splat(given))
+    check_near(read_splats(tmp_path / "a.SPLAT").gaussians, given, (0.0, 1e-3, 1e-6, 0.004, 0.014, 0.0))
+    (tmp_path / "a.splat").write_bytes(dot_splat(given)[:-1])
+    with pytest.raises(AwError, match="9599 bytes, not a multiple of 32"):
+        read_splats(tmp_path / "a.splat")
+
+
 def spz_of_version(version: int, given: Arrays) -> bytes:
     """Our SPZ in the layout of another version, as Niantic's reference (load-spz.cc) has it."""
     raw = gzip.decompress(b"".join(encode_spz(finite(given), antialias=True)))

@@ -9,7 +9,9 @@ import torch
 
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.splat import checkpoint
+from ambiguous_wild.splat.effects.autograd_effect import AutogradEffect, Leaf
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
+from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.training_loop import train
 from ambiguous_wild.splat.watchdog import FOLDER, GOOD, MAX_ROLLBACKS, REPORT, STEP, NonFinite, Watchdog
@@ -55,6 +57,44 @@ def test_a_gradient_is_named_and_kept_for_replay(scene, tmp_path):
     rows = ~torch.isfinite(seen["d_means"]).all(1)
     assert rows.nonzero()[:10, 0].tolist() == list(finding.rows)
     assert torch.equal(seen["photo"], trainer.data.photos[trainer.run_schedule.view(17)])
+
+
+class NoSlope(AutogradEffect):
+    """At iteration 17 the gradient of `gain` alone is not finite: a root has no slope at 0."""
+
+    name = "no-slope"
+
+    def leaves(self, data, rng):
+        return {"gain": Leaf(torch.zeros(len(data.photos)), 0.01, per_photo=True)}
+
+    def tone(self, image, alpha, leaf, context):
+        return image + (torch.sqrt(0 * leaf["gain"]) if context.iteration == 17 else 0 * leaf["gain"])
+
+
+def test_a_gradient_of_an_effect_is_named_before_it_is_learnt(scene, tmp_path):
+    effect = NoSlope()
+    trainer = trainer_for(scene, tmp_path, parts=MethodHooks(effects=(effect,)), iterations=60, probes=0)
+    with pytest.raises(NonFinite, match=r"^gradient of no-slope\.gain is not finite at iteration 17") as info:
+        train(trainer)
+    assert (info.value.finding.count, info.value.finding.rows) == (0, ())
+    assert bool(torch.isfinite(effect.state_dict()["gain"]["values"]).all())
+
+
+class PoisonsOther(MaskPolicy):
+    """Gradients of another field that are not finite."""
+
+    def gradients(self, step, keep):
+        parameters = {name: torch.zeros_like(value) for name, value in step.gaussians.items()}
+        zeros = Gradients(**parameters, screen=torch.zeros(len(step.gaussians), 2))
+        bad = replace(zeros, means=torch.full_like(zeros.means, math.nan))
+        return replace(zeros, fields={"transient": bad})
+
+
+def test_gradients_of_other_fields_are_checked(scene, tmp_path):
+    hooks = MethodHooks(mask=PoisonsOther())
+    trainer = trainer_for(scene, tmp_path, parts=hooks, iterations=10, probes=0)
+    with pytest.raises(NonFinite, match=r"^gradient of transient\.means is not finite at iteration 1"):
+        trainer.step()
 
 
 @pytest.mark.parametrize("name", ["means", "sh_rest"])

@@ -33,7 +33,7 @@ from job_queue import exit_code, find_scenes
 from scipy.stats import rankdata
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.regions import true_distractor
+from ambiguous_wild.harness.regions import exact_distractor
 from ambiguous_wild.io.files import write_json, write_text
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import get_method
@@ -42,7 +42,7 @@ from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.masks import enlarge, instance_means
 from ambiguous_wild.methods.refinesplat.paper import PaperConfig
 from ambiguous_wild.methods.refinesplat.recipe import consistency_loss, identity_loss, instance_matrix
-from ambiguous_wild.methods.refinesplat.threshold import contrast, entropy, surprise
+from ambiguous_wild.methods.refinesplat.threshold import cross_entropy, entropy, kl_divergence
 from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.losses import photometric
@@ -93,7 +93,7 @@ def judged(data: TrainData, renders: Sequence[torch.Tensor], backend: str, sigma
     grouped: dict[str, list[np.ndarray]] = {name: [] for name in STATISTICS}
     truth, guilty, sizes = [], [], []
     for view, render in enumerate(renders):
-        mask = true_distractor(data.scene, data.scene.train[view])
+        mask = exact_distractor(data.scene, data.scene.train[view])
         if mask is None:
             continue
         maps = _maps(found, view, render, data.photos[view], features, sigma)
@@ -131,8 +131,8 @@ def _maps(
     boxed = torch.nn.functional.avg_pool2d(residual, BOX, 1, BOX // 2, count_include_pad=False)[0, 0]
     maps = {
         "entropy": h,
-        "surprise": surprise(mine, theirs, sigma),
-        "contrast": contrast(mine, theirs, sigma),
+        "surprise": cross_entropy(mine, theirs, sigma),
+        "contrast": kl_divergence(mine, theirs, sigma),
         "distance": 1.0 - cosine,
         "residual": boxed,
     }

@@ -51,7 +51,7 @@ from ambiguous_wild.splat.backend import wait
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.gpu_kernels import photometric_fused
-from ambiguous_wild.splat.gsplat_seam import gsplat
+from ambiguous_wild.splat.gsplat_calls import gsplat
 from ambiguous_wild.splat.step import TrainData
 from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
@@ -179,7 +179,7 @@ def cost(args: argparse.Namespace, base: Trainer) -> dict[str, float]:
     endless = 10**6
     trainers = {name: late(trainer_of(args, name, endless), base.gaussians) for name in args.methods}
     loops: dict[str, Callable[[], Any]] = {name: trainer.step for name, trainer in trainers.items()}
-    loops["gsplat"] = PlainLoop(base.gaussians, base.data, base.pace.learning_rates(1.0)).step
+    loops["gsplat"] = PlainLoop(base.gaussians, base.data, base.run_schedule.learning_rates(1.0)).step
     for step in loops.values():  # every mask once, every kernel compiled
         for _ in range(args.warm_up):
             step()
@@ -286,7 +286,7 @@ def main(words: list[str] | None = None) -> int:
         return 0
     try:
         if args.device == "cuda":
-            readiness.require(readiness.look())
+            readiness.require_gpu(readiness.gpu_facts())
         cases = parity(args)
         trained = [train(args, method) for method in args.methods]
         ms = cost(args, trained[0][0])

@@ -11,14 +11,14 @@ right one.
 
 import torch
 
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt
+from ambiguous_wild.splat.effects.autograd_effect import AutogradEffect, Leaf
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.method_hooks import MethodHooks
 
 LAMPS = 2
 
 
-class Lamps(Learnt):
+class Lamps(AutogradEffect):
     """colour' = colour (1 + sum of lamps: what the Gaussian takes of it, times the lamp's colour)."""
 
     name = "lamps"

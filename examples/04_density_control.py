@@ -11,7 +11,7 @@ per Gaussian, carried through growth and pruning, and saved in checkpoints.
 
 import torch
 
-from ambiguous_wild.splat.density import DensityControl, Growth, largest
+from ambiguous_wild.splat.density import DensityControl, Growth, top_k_mask
 from ambiguous_wild.splat.method_hooks import MethodHooks
 
 
@@ -32,7 +32,7 @@ class ByPixels(DensityControl):
 
     def choose(self, step, gaussians) -> Growth:
         score = self.grad_sum / self.pixels.clamp(min=1)
-        chosen = largest(score, score > self.config.grow_grad, self.room(step, gaussians))
+        chosen = top_k_mask(score, score > self.config.grow_grad, self.room(step, gaussians))
         small = self.small(gaussians)
         clones, splits = (torch.nonzero(chosen & rows).squeeze(1) for rows in (small, ~small))
         return Growth(clones, splits)

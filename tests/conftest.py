@@ -89,9 +89,9 @@ def pytest_collection_modifyitems(config, items):
     wanted = [item for item in items if item.get_closest_marker("gpu")]
     if not wanted:
         return
-    from ambiguous_wild.splat.readiness import look, why_not
+    from ambiguous_wild.splat.readiness import gpu_facts, missing_dependency
 
-    lack = why_not(look())
+    lack = missing_dependency(gpu_facts())
     if lack is not None:
         skip = pytest.mark.skip(reason=f"no GPU to test on: {lack.what}")
         for item in wanted:
@@ -106,7 +106,7 @@ def pytest_runtest_setup(item):
     """
     calibration = sys.modules.get("ambiguous_wild.splat.calibration")
     if calibration is not None:
-        calibration.KERNELS["cpu"] = calibration.Size("cpu-3", 0.0625, 300, 32, 32, 1)
+        calibration.KERNELS["cpu"] = calibration.KernelSize("cpu-3", 0.0625, 300, 32, 32, 1)
     evaluate = sys.modules.get("ambiguous_wild.harness.evaluate")
     if evaluate is not None:
         evaluate.FPS_SECONDS = 0.05  # two seconds a run, which say nothing here

@@ -15,7 +15,7 @@ MIN_ANGLE_DEG = 2.0
 MAX_ANGLES = 1000  # points of which it is computed
 
 
-def pipeline_options(seed: int) -> Any:
+def deterministic_pipeline_options(seed: int) -> Any:
     """Return COLMAP's options on one thread, because bundle adjustment sums in the order of its threads."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
@@ -24,14 +24,14 @@ def pipeline_options(seed: int) -> Any:
     return options
 
 
-def plausible(model: Any) -> bool:
+def plausible_distortion(model: Any) -> bool:
     """Tell whether the distortion is that of a lens: few or flat photos leave it undetermined."""
     low, high = DISTORTIONS
     return all(low <= camera.params[-1] <= high for camera in model.cameras.values())
 
 
-def shows_depth(model: Any) -> bool:
-    """Tell whether photos saw points from apart; a camera that only turned gives points at any depth."""
+def has_parallax(model: Any) -> bool:
+    """Tell whether points were seen under enough parallax; pure rotation gives points at any depth."""
     centres = {k: model.images[k].projection_center() for k in model.reg_image_ids()}
     points = list(model.points3D.values())
     angles = []
@@ -43,8 +43,8 @@ def shows_depth(model: Any) -> bool:
     return bool(angles) and float(np.percentile(angles, 90)) >= MIN_ANGLE_DEG
 
 
-def adjustment_options(distorted: bool, photos: int, *, final: bool) -> Any:
-    """Return options of a joint adjustment on one thread in which an outlier counts little."""
+def bundle_adjustment_options(distorted: bool, photos: int, *, final: bool) -> Any:
+    """Return options of a bundle adjustment on one thread with a robust loss."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params = distorted
     options.print_summary = False

@@ -19,8 +19,8 @@ from ambiguous_wild.builder.overlap_graph import (
     Link,
     best_link_between,
     bridges,
-    graph_of,
-    lay_out,
+    graph_layout,
+    overlap_graph,
     weakly_connected,
 )
 from ambiguous_wild.builder.records import MappingResult
@@ -35,7 +35,7 @@ DOWN = 0.8  # share of the mean viewing direction along the normal of a plane fr
 # than this share of the second.
 WIDE, THIN = 0.15, 0.4
 CORE = 80  # percent of the points, the nearest to their median, by which their thinnest axis is measured
-AGREE = 0.9  # length of the mean viewing direction from which on all cameras look the same way
+AXES_AGREE = 0.9  # length of the mean viewing direction from which on all cameras look the same way
 # Length of the mean up direction from which on up is determined. It is 0.34 to 0.67 for nadir strips flown
 # back and forth (seneca), 0.96 or more for photos taken by hand (monstree, sceaux, statue, reichstag).
 UPRIGHT = 0.7
@@ -152,7 +152,7 @@ def map_of_photos(
     """Return the map of photos without poses: near each other if they overlap much."""
     main = set(growth.components[0]) if growth.components else set()
     in_component = {photo for component in growth.components[1:] for photo in component}
-    xy = lay_out(len(sources), links)
+    xy = graph_layout(len(sources), links)
     photos = [
         MapPhoto(
             printable(source),
@@ -201,7 +201,7 @@ def component_gaps(growth: GrowthForecast, links: Sequence[Link]) -> list[tuple[
     return pairs
 
 
-def between(first: str, second: str) -> str:
+def connection_advice(first: str, second: str) -> str:
     """Return the advice for two photos that hardly overlap."""
     return f"take 2 or 3 photos between {first} and {second}"
 
@@ -291,7 +291,7 @@ def _nadir_axis(
     one way and a walk along a facade differ in their path: a strip goes along up in the photos, and a view
     along up would hide it. A strip flown sideways cannot be told from a walk, and is drawn as one.
     """
-    agreeing = bool(np.linalg.norm(view) > AGREE)
+    agreeing = bool(np.linalg.norm(view) > AXES_AGREE)
     axis = cameras_axis if cameras_axis is not None and abs(view @ cameras_axis) > DOWN else None
     if axis is None and agreeing and points is not None:
         normal = _thin_axis(points)
@@ -332,7 +332,7 @@ def _with_links(drawn: CaptureMap, links: Sequence[Link]) -> CaptureMap:
     photos = drawn.photos
     kept = [k for k, photo in enumerate(photos) if photo.kind in ("train", "test")]
     weak_photos = set(weakly_connected(kept, links)) if links else set()
-    weak = bridges(graph_of(len(photos), links))
+    weak = bridges(overlap_graph(len(photos), links))
     strongest: set[tuple[int, int]] = set()
     of: list[list[Link]] = [[] for _ in photos]
     for link in sorted(links, key=lambda link: (-link[2], link)):
@@ -347,13 +347,13 @@ def _with_links(drawn: CaptureMap, links: Sequence[Link]) -> CaptureMap:
         for a, b, matches in links
         if (a, b) in strongest | wanted
     ]
-    asked = sorted((m, a, b) for a, b, m in links if (a, b) in wanted)
+    to_strengthen = sorted((m, a, b) for a, b, m in links if (a, b) in wanted)
     return replace(
         drawn,
         photos=[replace(photo, weak=k in weak_photos) for k, photo in enumerate(photos)],
         links=shown,
-        stars=[_middle(photos[a], photos[b]) for _, a, b in asked],
-        advice=[_between(photos[a], photos[b]) for _, a, b in asked],
+        stars=[_middle(photos[a], photos[b]) for _, a, b in to_strengthen],
+        advice=[_between(photos[a], photos[b]) for _, a, b in to_strengthen],
     )
 
 
@@ -399,7 +399,10 @@ def _with_left_out(
         photos=photos,
         links=links,
         stars=stars,
-        advice=[*drawn.advice, *(between(name, shortlist(lost, 3)) for name, lost in wanted.items())],
+        advice=[
+            *drawn.advice,
+            *(connection_advice(name, shortlist(lost, 3)) for name, lost in wanted.items()),
+        ],
         listed=[*drawn.listed, *(f"{shortlist(names, 3)}: {why}" for why, names in reasons.items())],
     )
 
@@ -430,7 +433,7 @@ def _beside(
 
 
 def _between(first: MapPhoto, second: MapPhoto) -> str:
-    return between(first.name, second.name)
+    return connection_advice(first.name, second.name)
 
 
 def _sorted(pair: tuple[int, int]) -> tuple[int, int]:

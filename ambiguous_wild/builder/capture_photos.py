@@ -183,11 +183,11 @@ def _frames_of(video: Path, folder: Path, frames: int, bar: Bar) -> tuple[list[C
         )
     times, announced = _times(video, bar)
     total = len(times)
-    limits = stretches(times, frames)
+    limits = time_intervals(times, frames)
     expected = len(set(np.searchsorted(limits, times, side="right")))
     bar.start("frames", total)
     folder.mkdir(parents=True, exist_ok=True)
-    photos = _write(sharpest(_read(video, times, bar), limits), folder)
+    photos = _write(sharpest_frames(_read(video, times, bar), limits), folder)
     bar.finish()
     if len(photos) < expected:
         raise AwError(
@@ -198,7 +198,7 @@ def _frames_of(video: Path, folder: Path, frames: int, bar: Bar) -> tuple[list[C
     return photos, {"frames_read": total, "frames_announced": announced}
 
 
-def stretches(times: Sequence[float], frames: int) -> list[float]:
+def time_intervals(times: Sequence[float], frames: int) -> list[float]:
     """Return the limits in seconds of equally long stretches of a video; few frames get a stretch each.
 
     Args:
@@ -264,7 +264,7 @@ def photos_from_camera(
         with atomic_dir(out, replace=False) as folder:
             limits = [k * step / fps for k in range(frames + 1)]
             taken = (i / fps for i in range(frames * step))
-            photos = _write(sharpest(_frames(reader, taken, bar), limits), folder)
+            photos = _write(sharpest_frames(_frames(reader, taken, bar), limits), folder)
             bar.finish()
             if len(photos) < frames:
                 raise AwError(
@@ -275,7 +275,7 @@ def photos_from_camera(
         reader.release()
 
 
-def sharpest(
+def sharpest_frames(
     frames: Iterator[tuple[int, float, np.ndarray]],  # index, seconds, BGR
     limits: Sequence[float],  # seconds: where each part begins, and the end
 ) -> Iterator[VideoFrame]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ambiguous_wild.builder.capture_map import CaptureMap, component_gaps, map_of_photos
 from ambiguous_wild.builder.collect import collect
-from ambiguous_wild.builder.fixed_to_camera import words_of
+from ambiguous_wild.builder.fixed_to_camera import area_text
 from ambiguous_wild.builder.overlap_graph import FEW_COVISIBLE, GrowthForecast, Link, predict_growth
 from ambiguous_wild.builder.photo_comparison import (
     PhotoComparison,
@@ -272,7 +272,7 @@ def fixed_to_camera(compared: PhotoComparison) -> CaptureCheck:
     if not compared.fixed:
         return CaptureCheck("fixed to camera", "ok", "pixels", "nothing stands still while the rest moves")
     shown = "; ".join(
-        words_of(area.share, area.where())
+        area_text(area.share, area.where())
         + (f" of {area.size[0]}x{area.size[1]}" if len(compared.fixed) > 1 else "")
         for area in compared.fixed
     )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambiguous_wild.builder.matched import Matched, PointLookup
+from ambiguous_wild.builder.matched import MatchedPhotos, PointLookup
 from ambiguous_wild.builder.registration import (
     ALIKE_DEG,
     INLIER_RATIO,
@@ -21,7 +21,7 @@ from ambiguous_wild.builder.registration import (
     Registration,
     centre_of,
 )
-from ambiguous_wild.builder.relative_poses import Pair, trace_of
+from ambiguous_wild.builder.relative_poses import Pair, rotation_trace
 
 MIN_MERGE_PAIRS = 2  # pairs across two components that must support the merge; they involve one more photo
 # Smallest singular value of the equations for scale and shift, relative to the largest: along a straight path
@@ -42,24 +42,27 @@ class Similarity:
     rotation: np.ndarray  # [3, 3]
     shift: np.ndarray  # [3]
 
-    def moved(self, pose: np.ndarray) -> np.ndarray:
+    def transform_pose(self, pose: np.ndarray) -> np.ndarray:
         """Return a pose [3, 4], camera from world, in the coordinates of the first component."""
         rotation = pose[:, :3] @ self.rotation.T
         return np.column_stack([rotation, self.scale * pose[:, 3] - rotation @ self.shift])
 
 
-def merge(first: Registration, second: Registration) -> bool:
+def merge_components(first: Registration, second: Registration) -> bool:
     """Add the photos of the second component if enough pairs support it; the first must then run again."""
     added = {photo: pose for photo, pose in second.poses.items() if photo not in first.poses}
     if not added or min(len(first.poses), len(second.poses)) < MIN_MODEL_PHOTOS:
         return False
-    rotations = _rotations(first, second)
+    rotations = _implied_rotations(first, second)
     alike = _alike(rotations)
     before = [list(camera.params) for camera in first.matched.cameras]  # params are a view
     _take_cameras(first, second, added)
     best: tuple[int, Similarity] | None = None
-    for similarity in (*_by_photos(first, second), *_by_pairs(first, second, rotations, alike)):
-        moved = {photo: similarity.moved(pose) for photo, pose in added.items()}
+    for similarity in (
+        *_similarities_from_photos(first, second),
+        *_similarities_from_pairs(first, second, rotations, alike),
+    ):
+        moved = {photo: similarity.transform_pose(pose) for photo, pose in added.items()}
         support = _supporting_pairs(first, moved)
         photos = {photo for pair in support for photo in pair}
         if len(support) < MIN_MERGE_PAIRS or len(photos) <= MIN_MERGE_PAIRS:
@@ -72,7 +75,7 @@ def merge(first: Registration, second: Registration) -> bool:
         for camera, params in zip(first.matched.cameras, before):
             camera.params = params
         return False
-    first.poses.update((photo, best[1].moved(pose)) for photo, pose in added.items())
+    first.poses.update((photo, best[1].transform_pose(pose)) for photo, pose in added.items())
     first.merged.append(frozenset(added))
     return True
 
@@ -86,50 +89,62 @@ def _take_cameras(first: Registration, second: Registration, added: Collection[i
 
 
 @dataclass(frozen=True)
-class Across:
+class ImpliedRotation:
     """The rotation between two components that a relative pose of a pair across them implies."""
 
     pair: Pair
-    here: int  # photo of the first component
-    there: int  # photo of the second component
+    first_photo: int  # of the first component
+    second_photo: int  # of the second component
     rotation: np.ndarray  # [3, 3] first from second
     direction: np.ndarray  # [3] from the first photo to the second, in the first component
 
 
-def _rotations(first: Registration, second: Registration) -> list[Across]:
+def _implied_rotations(first: Registration, second: Registration) -> list[ImpliedRotation]:
     """Return the rotations that the relative poses of the strongest pairs across two components imply."""
-    rows: list[Across] = []
+    rows: list[ImpliedRotation] = []
     of_pairs = first.matched.relative_poses.items()
     strongest = sorted(of_pairs, key=lambda item: -sum(len(relative.matches) for relative in item[1]))
     for pair, relative_poses in strongest:
         if len({row.pair for row in rows}) >= MAX_PAIRS:
             break
-        for here, there in (pair, pair[::-1]):
-            if here not in first.poses or there not in second.poses or {here, there} <= first.poses.keys():
+        for photo_a, photo_b in (pair, pair[::-1]):
+            if (
+                photo_a not in first.poses
+                or photo_b not in second.poses
+                or {photo_a, photo_b} <= first.poses.keys()
+            ):
                 continue
-            mine, theirs = first.poses[here][:, :3], second.poses[there][:, :3]
+            rotation_a, rotation_b = first.poses[photo_a][:, :3], second.poses[photo_b][:, :3]
             for relative_pose in relative_poses:
                 for rotation, shift in zip(relative_pose.rotations, relative_pose.translations):
-                    centre = -rotation.T @ shift if here == pair[0] else shift
-                    relative = rotation if here == pair[0] else rotation.T  # there from here
-                    rows.append(Across(pair, here, there, mine.T @ relative.T @ theirs, mine.T @ centre))
+                    centre = -rotation.T @ shift if photo_a == pair[0] else shift
+                    relative = rotation if photo_a == pair[0] else rotation.T  # photo_b from photo_a
+                    rows.append(
+                        ImpliedRotation(
+                            pair,
+                            photo_a,
+                            photo_b,
+                            rotation_a.T @ relative.T @ rotation_b,
+                            rotation_a.T @ centre,
+                        )
+                    )
     return rows
 
 
-def _alike(rows: Sequence[Across]) -> np.ndarray:
+def _alike(rows: Sequence[ImpliedRotation]) -> np.ndarray:
     """Tell which rows imply the same rotation, [N, N] bool."""
     stack = np.array([row.rotation for row in rows]).reshape(-1, 9)
-    return stack @ stack.T > trace_of(ALIKE_DEG)
+    return stack @ stack.T > rotation_trace(ALIKE_DEG)
 
 
 def _competing_pairs(
-    rows: Sequence[Across], alike: np.ndarray, similarity: Similarity, support: Collection[Pair]
+    rows: Sequence[ImpliedRotation], alike: np.ndarray, similarity: Similarity, support: Collection[Pair]
 ) -> int:
     """Return the largest number of pairs that agree on one rotation other than that of the similarity."""
     others = [
         k
         for k, row in enumerate(rows)
-        if row.pair not in support and np.sum(row.rotation * similarity.rotation) < trace_of(ALIKE_DEG)
+        if row.pair not in support and np.sum(row.rotation * similarity.rotation) < rotation_trace(ALIKE_DEG)
     ]
     if not others:
         return 0
@@ -138,14 +153,14 @@ def _competing_pairs(
     return int((alike[np.ix_(others, others)] @ owned > 0).sum(axis=1).max())
 
 
-def _by_pairs(
-    first: Registration, second: Registration, across: Sequence[Across], same: np.ndarray
+def _similarities_from_pairs(
+    first: Registration, second: Registration, across: Sequence[ImpliedRotation], same: np.ndarray
 ) -> Iterator[Similarity]:
     """Yield the similarities on which pairs across them agree, the rotation first, then directions."""
     known: set[frozenset[tuple[int, int]]] = set()
     for which in same:
         alike = [row for row, use in zip(across, which) if use]
-        ends = frozenset((row.here, row.there) for row in alike)
+        ends = frozenset((row.first_photo, row.second_photo) for row in alike)
         if len(ends) < MIN_MERGE_PAIRS or ends in known:
             continue
         known.add(ends)
@@ -155,8 +170,8 @@ def _by_pairs(
         rows, values = [], []
         for row in alike:
             ray = np.cross(np.eye(3), row.direction).T  # ray @ v = cross(direction, v)
-            rows.append(np.column_stack([ray @ rotation @ centre_of(second.poses[row.there]), ray]))
-            values.append(ray @ centre_of(first.poses[row.here]))
+            rows.append(np.column_stack([ray @ rotation @ centre_of(second.poses[row.second_photo]), ray]))
+            values.append(ray @ centre_of(first.poses[row.first_photo]))
         system = np.concatenate(rows) * [1 / second.radius, 1.0, 1.0, 1.0]
         scale, *shift = np.linalg.lstsq(system, np.concatenate(values), rcond=None)[0]
         singular_values = np.linalg.svd(system, compute_uv=False)
@@ -164,15 +179,23 @@ def _by_pairs(
             yield Similarity(float(scale) / second.radius, rotation, np.array(shift))
 
 
-def _by_photos(first: Registration, second: Registration) -> Iterator[Similarity]:
+def _similarities_from_photos(first: Registration, second: Registration) -> Iterator[Similarity]:
     """Yield the similarity that each pose of a photo in both components implies."""
-    here, there = PointLookup.read(first.matched, first.model), PointLookup.read(second.matched, second.model)
+    first_points, second_points = (
+        PointLookup.read(first.matched, first.model),
+        PointLookup.read(second.matched, second.model),
+    )
     for photo in sorted({*first.poses, *second.poses}):
-        mine = [first.poses[photo]] if photo in first.poses else first.resections(photo, here)
-        theirs = [second.poses[photo]] if photo in second.poses else second.resections(photo, there)
-        depths = _depths(photo, mine, first, here), _depths(photo, theirs, second, there)
-        for pose, near in zip(mine, depths[0]):
-            for other, far in zip(theirs, depths[1]):
+        first_poses = [first.poses[photo]] if photo in first.poses else first.resections(photo, first_points)
+        second_poses = (
+            [second.poses[photo]] if photo in second.poses else second.resections(photo, second_points)
+        )
+        depths = (
+            _depths(photo, first_poses, first, first_points),
+            _depths(photo, second_poses, second, second_points),
+        )
+        for pose, near in zip(first_poses, depths[0]):
+            for other, far in zip(second_poses, depths[1]):
                 both = sorted(near.keys() & far.keys())
                 if len(both) < MIN_DEPTHS:
                     continue
@@ -192,7 +215,7 @@ def _depths(
 
 def _supporting_pairs(first: Registration, moved: Mapping[int, np.ndarray]) -> set[Pair]:
     """Return the pairs across with a relative pose whose inliers are clustered in neither photo."""
-    matched: Matched = first.matched
+    matched: MatchedPhotos = first.matched
     normalised, poses = matched.normalised(), {**moved, **first.poses}
     support = set()
     for (a, b), relative_poses in matched.relative_poses.items():

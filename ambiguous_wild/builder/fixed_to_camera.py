@@ -131,7 +131,7 @@ def moving_matches(
     return left
 
 
-def words_of(share: float, where: str) -> str:
+def area_text(share: float, where: str) -> str:
     """Return "the lower 20 % of every photo", or "2 % of every photo (lower right)"."""
     percent = f"{100 * share:.0f} %" if share >= 0.01 else "under 1 %"
     if where and " " not in where:

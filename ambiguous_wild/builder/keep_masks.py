@@ -99,7 +99,7 @@ def alpha_mask(capture: Path, photo: ScreenedPhoto) -> np.ndarray | None:  # [H,
     return None if alpha is None else upright(alpha, photo.exif.get("orientation", 1))
 
 
-def lay_out_masks(
+def write_colmap_masks(
     folder: Path, mask_files: Mapping[str, Path], photos: Sequence[ScreenedPhoto], capture: Path
 ) -> MaskResult:
     """Write every photo's mask times its alpha, 0 or 255, to `folder/masks/<name>.png` for COLMAP.
@@ -145,7 +145,7 @@ def add_fixed(
         photos: of the capture.
         matches: folder of the fixed masks.
         fixed: fixed masks.
-        before: folder of the masks so far, as `lay_out_masks` writes them; None: there are none.
+        before: folder of the masks so far, as `write_colmap_masks` writes them; None: there are none.
         shares: stem -> share that these keep.
 
     Returns:

@@ -50,7 +50,7 @@ COLOURS: dict[Kind, tuple[int, int, int]] = {
 }
 
 
-def draw_built(
+def draw_scene_map(
     folder: Path,
     model: ColmapModel,
     mapping: MappingResult,
@@ -78,7 +78,7 @@ def frame(drawn: CaptureMap) -> tuple[tuple[float, float], float]:
     return as_pair((low + high) / 2), unit
 
 
-def place_names(
+def place_labels(
     xy: np.ndarray,  # [N or more, 2] px, positions of the cameras, then of other symbols, y up
     names: Sequence[str],
     order: Sequence[int],  # photos in the order in which they get room
@@ -286,7 +286,7 @@ def _draw_names(
     ahead = np.array([photo.heading or (0.0, 0.0) for photo in photos])
     dots = np.concatenate([xy, stars, xy + 0.4 * wedge_length(xy) * ahead])
     names = [drawn.labels.get(photo.name, photo.name) for photo in photos]
-    for k, corner in place_names(dots, names, order, size).items():
+    for k, corner in place_labels(dots, names, order, size).items():
         axes.text(
             *corner, names[k], fontsize=_points(NAME_PX), va="bottom", zorder=6, parse_math=False,
             color=plot_colour(COLOURS[photos[k].kind]),

@@ -11,9 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from ambiguous_wild.builder.bundle_adjustment import pipeline_options, plausible, shows_depth
-from ambiguous_wild.builder.component_merging import merge
-from ambiguous_wild.builder.matched import Matched, connected_photos
+from ambiguous_wild.builder.bundle_adjustment import (
+    deterministic_pipeline_options,
+    has_parallax,
+    plausible_distortion,
+)
+from ambiguous_wild.builder.component_merging import merge_components
+from ambiguous_wild.builder.matched import MatchedPhotos, connected_photos
 from ambiguous_wild.builder.records import PURE_ROTATION, ModelSummary, no_model
 from ambiguous_wild.builder.registration import MIN_MODEL_PHOTOS, Registration
 from ambiguous_wild.builder.retrieval import FEW_PHOTOS, RELATIVE_POSES
@@ -41,9 +45,9 @@ def run_mapping(job: MappingJob) -> None:
         _write(job, output, placed, [placed], len(placed.poses))
         return
     ThreadPoolExecutor(1).submit(importlib.import_module, "networkx")  # while COLMAP maps
-    matched = Matched.read(database)
+    matched = MatchedPhotos.read(database)
     models = _models(job, output, matched)
-    if models and not plausible(models[0]):
+    if models and not plausible_distortion(models[0]):
         matched.distorted = False
         models = _models(job, output, matched)
     components: list[Registration] = []
@@ -51,7 +55,9 @@ def run_mapping(job: MappingJob) -> None:
         change = matched.take_cameras(max(models, key=_size))
         competing = _models(job, output, matched, constant_focal=True) if change > FOCAL_DOUBT else []
         if competing:
-            other = Matched.read(database)  # read now, while the database has the focal length of the votes
+            other = MatchedPhotos.read(
+                database
+            )  # read now, while the database has the focal length of the votes
             other.distorted = matched.distorted
         if change > FOCAL_CHANGE:
             # The poses of pairs were wrong by as much, so verify and map again with the model's focal length.
@@ -70,7 +76,7 @@ def run_mapping(job: MappingJob) -> None:
         component.mark_provisional()
     reliable = len(components[0].poses.keys() - components[0].provisional) if components else 0
     why = "no pair of photos to start from"
-    if chosen is not None and len(chosen.poses) >= MIN_MODEL_PHOTOS and not shows_depth(chosen.model):
+    if chosen is not None and len(chosen.poses) >= MIN_MODEL_PHOTOS and not has_parallax(chosen.model):
         chosen, components, reliable, why = None, [], 0, PURE_ROTATION
     if chosen is None or len(chosen.poses) < MIN_MODEL_PHOTOS:
         left_out = dict.fromkeys(matched.names, why)
@@ -86,7 +92,7 @@ def run_mapping(job: MappingJob) -> None:
 
 def _with_known_cameras(job: MappingJob, database: Path, known: Path) -> Registration:
     """Return all photos at their exact poses, with points triangulated from the matches that fit these."""
-    matched = Matched.read(database)  # with the exact cameras
+    matched = MatchedPhotos.read(database)  # with the exact cameras
     matched.find_relative_poses(job["jobs"])
     # Points that only two photos observe are kept, as when mapping: twice the points to begin training with.
     model = triangulate_known(database, known, job["photos"], known, job["seed"], pairs=True)
@@ -112,10 +118,10 @@ def triangulate_known(
         the model of pycolmap.
     """
     posed = pycolmap.Reconstruction(str(known))
-    matched = Matched.read(database)
+    matched = MatchedPhotos.read(database)
     matched.take_cameras(posed)
     matched.write_verified(database, matched.verified_pairs(matched.poses(posed)))
-    options = pipeline_options(seed)
+    options = deterministic_pipeline_options(seed)
     if pairs:
         options.triangulation.ignore_two_view_tracks = False
     return pycolmap.triangulate_points(
@@ -193,7 +199,9 @@ def _explained(registration: Registration) -> int:
     return int(registration.model.compute_num_observations()) if enough else 0
 
 
-def _models(job: MappingJob, output: Path, matched: Matched, *, constant_focal: bool = False) -> list[Any]:
+def _models(
+    job: MappingJob, output: Path, matched: MatchedPhotos, *, constant_focal: bool = False
+) -> list[Any]:
     """Return the models of COLMAP's mapper, and of the global one if it leaves photos out; largest first."""
     models: list[Any] = []
     connected = connected_photos(Path(job["database"]))
@@ -218,7 +226,9 @@ def _size(model: Any) -> tuple[int, int]:
     return model.num_reg_images(), model.num_points3D()
 
 
-def _register(job: MappingJob, database: Path, matched: Matched, models: Sequence[Any]) -> list[Registration]:
+def _register(
+    job: MappingJob, database: Path, matched: MatchedPhotos, models: Sequence[Any]
+) -> list[Registration]:
     """Register photos from the first model, and those it leaves out from the others; merge the components.
 
     Returns:
@@ -249,7 +259,7 @@ def _register(job: MappingJob, database: Path, matched: Matched, models: Sequenc
     while merged:
         before, cameras = dict(best.poses), best.matched.copy()
         for other in others:
-            merge(best, other)
+            merge_components(best, other)
         merged = len(best.poses) > len(before)
         if merged:
             best.run()
@@ -268,7 +278,7 @@ def _register(job: MappingJob, database: Path, matched: Matched, models: Sequenc
 def _map_incrementally(
     job: MappingJob, output: Path, distorted: bool, constant_focal: bool
 ) -> dict[int, Any]:
-    options = pipeline_options(job["seed"])
+    options = deterministic_pipeline_options(job["seed"])
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not constant_focal
     options.min_model_size = MIN_MODEL_PHOTOS
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted

@@ -35,7 +35,7 @@ MAPPED_COVISIBLE = 5  # covisible photos that the mapper gets of every photo, so
 
 
 @dataclass
-class Matched:
+class MatchedPhotos:
     """Photos with features and matched pairs, without poses; a photo's number is its index in `ids`."""
 
     ids: list[int]  # image ids of COLMAP
@@ -47,7 +47,7 @@ class Matched:
     distorted: bool = True  # whether the lens's distortion is estimated; else there is none
 
     @classmethod
-    def read(cls, database: Path) -> Matched:
+    def read(cls, database: Path) -> MatchedPhotos:
         """Read COLMAP's database; relative poses are not in it."""
         db = pycolmap.Database.open(str(database))
         try:
@@ -69,7 +69,7 @@ class Matched:
         finally:
             db.close()
 
-    def copy(self) -> Matched:
+    def copy(self) -> MatchedPhotos:
         """Return a copy with cameras of its own; features, matches and relative poses are shared."""
         cameras = {camera.camera_id: copy.deepcopy(camera) for camera in self.cameras}
         return replace(self, cameras=[cameras[camera.camera_id] for camera in self.cameras])
@@ -243,13 +243,13 @@ class Matched:
 class PointLookup:
     """Points of a model, found by the features that observe them: the 2D-3D matches of a photo."""
 
-    matched: Matched
+    matched: MatchedPhotos
     rows: list[np.ndarray]  # a photo each: [N] row of `xyz` that a feature observes, -1 without a point
     xyz: np.ndarray  # [P, 3]
     views: np.ndarray  # [P] number of photos that observe the point
 
     @classmethod
-    def read(cls, matched: Matched, model: Any) -> PointLookup:
+    def read(cls, matched: MatchedPhotos, model: Any) -> PointLookup:
         at = {number: k for k, number in enumerate(matched.ids)}
         rows = [np.full(len(f), -1) for f in matched.features]
         xyz, views = np.zeros((len(model.points3D), 3)), np.zeros(len(model.points3D), int)

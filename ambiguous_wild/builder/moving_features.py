@@ -17,7 +17,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ambiguous_wild.builder.matched import Matched
+from ambiguous_wild.builder.matched import MatchedPhotos
 from ambiguous_wild.builder.records import MotionResult
 from ambiguous_wild.builder.registration import INLIER_RATIO
 from ambiguous_wild.builder.relative_poses import MIN_INLIERS
@@ -35,8 +35,8 @@ MIN_CONSISTENT = 0.25  # share of the covisible photos that must be consistent w
 # share of the photo's longer side, which must be deeper by this factor.
 AROUND, THROUGH, BEHIND = 12, 0.02, 1.2
 MIN_THROUGH = 2  # photos that must see through a point
-NEIGHBOURS = 0.05  # share of the longer side: points seen through that lie as near belong to one thing
-MIN_OF_THING = 3  # points of one thing
+NEIGHBOURS = 0.05  # share of the longer side: points seen through that lie as near belong to one object
+MIN_OBJECT_POINTS = 3  # points of one object
 
 
 @dataclass
@@ -51,7 +51,7 @@ class Votes:
 
 
 def count_votes(
-    matched: Matched, poses: Mapping[int, np.ndarray], voters: Collection[int]
+    matched: MatchedPhotos, poses: Mapping[int, np.ndarray], voters: Collection[int]
 ) -> dict[int, Votes]:
     """Count how many photos call each feature static or moving, by the matches among the voters.
 
@@ -67,17 +67,20 @@ def count_votes(
             continue
         errors = matched.epipolar_error((a, b), poses[a], poses[b], normalised)
         relative_poses = matched.relative_poses.get((a, b), [])
-        static = [bool(np.mean(errors[found.matches] <= 1.0) >= INLIER_RATIO) for found in relative_poses]
+        static = [
+            bool(np.mean(errors[relative_pose.matches] <= 1.0) >= INLIER_RATIO)
+            for relative_pose in relative_poses
+        ]
         for photo in (a, b):
             votes[photo].covisible += bool(relative_poses)
             votes[photo].consistent += any(static)
-        for found, is_static in zip(relative_poses, static):
+        for relative_pose, is_static in zip(relative_poses, static):
             if is_static:
-                inliers = rows[found.matches[errors[found.matches] <= 1.0]]
+                inliers = rows[relative_pose.matches[errors[relative_pose.matches] <= 1.0]]
                 votes[a].static[inliers[:, 0]] += 1
                 votes[b].static[inliers[:, 1]] += 1
             # A relative pose of static scene and distractor together also has outliers.
-            moving = rows[found.matches[errors[found.matches] > CLEARLY]]
+            moving = rows[relative_pose.matches[errors[relative_pose.matches] > CLEARLY]]
             if len(moving) >= MIN_INLIERS:
                 for photo, features in ((a, moving[:, 0]), (b, moving[:, 1])):
                     votes[photo].moving[features] += 1
@@ -85,7 +88,9 @@ def count_votes(
     return votes
 
 
-def seen_through(model: pycolmap.Reconstruction, photos: Mapping[int, int]) -> dict[int, np.ndarray]:
+def free_space_violation_counts(
+    model: pycolmap.Reconstruction, photos: Mapping[int, int]
+) -> dict[int, np.ndarray]:
     """Count for every feature of a photo, [N], the photos that show what lies behind its 3D point.
 
     A distractor that stands still in some photos and is gone in others has points like the static scene. A
@@ -107,26 +112,26 @@ def seen_through(model: pycolmap.Reconstruction, photos: Mapping[int, int]) -> d
         local = xyz @ pose[:, :3].T + pose[:, 3]
         others = local[:, 2] > 0
         others[own] = False
-        asked, size = np.flatnonzero(others), np.array([camera.width, camera.height])
-        if not len(own) or not len(asked):
+        candidates, size = np.flatnonzero(others), np.array([camera.width, camera.height])
+        if not len(own) or not len(candidates):
             continue
-        xy, around = (np.asarray(camera.img_from_cam(local[which])) for which in (asked, own))
+        xy, around = (np.asarray(camera.img_from_cam(local[which])) for which in (candidates, own))
         seen = np.flatnonzero(((xy >= 0) & (xy < size)).all(axis=1))  # NaN: outside of what the lens can show
-        asked, xy = asked[seen], xy[seen]
+        candidates, xy = candidates[seen], xy[seen]
         reach = THROUGH * size.max()
         away, near = cKDTree(around).query(xy, AROUND, distance_upper_bound=reach)
         some, near = np.isfinite(away), np.minimum(near, len(own) - 1)
         side = (around[near] > xy[:, None]) @ [1, 2]
-        sides = np.zeros(len(asked), int)
+        sides = np.zeros(len(candidates), int)
         for quarter in range(4):
             sides += (some & (side == quarter)).any(axis=1)
-        behind = ~some | (local[own][near, 2] > BEHIND * local[asked, 2][:, None])
-        through[asked] += (sides >= 3) & behind.all(axis=1)
+        behind = ~some | (local[own][near, 2] > BEHIND * local[candidates, 2][:, None])
+        through[candidates] += (sides >= 3) & behind.all(axis=1)
     return {photo: through[numbers] for photo, numbers in rows.items()}
 
 
 def motion_points(
-    matched: Matched,
+    matched: MatchedPhotos,
     poses: Mapping[int, np.ndarray],
     train: Collection[str],
     pinholes: Mapping[str, ModelCamera],
@@ -141,15 +146,15 @@ def motion_points(
         poses: photo -> [3, 4] camera from world.
         train: names of the train photos.
         pinholes: name -> camera of the undistorted photo.
-        through: photo -> result of `seen_through`.
+        through: photo -> result of `free_space_violation_counts`.
     """
     voters = {k: name for k, name in enumerate(matched.names) if name in train}
     normalised, points = matched.normalised(), {}
     for photo, votes in count_votes(matched, poses, voters).items():
         reach = NEIGHBOURS * max(matched.cameras[photo].width, matched.cameras[photo].height)
-        for thing in _group_features(matched.features[photo], through.get(photo, np.zeros(0)), reach):
-            votes.moving[thing] += through[photo][thing]
-            votes.motions.append(thing)
+        for group in _group_features(matched.features[photo], through.get(photo, np.zeros(0)), reach):
+            votes.moving[group] += through[photo][group]
+            votes.motions.append(group)
         camera = pinholes[voters[photo]]
         fx, fy, cx, cy = camera.pinhole()
         xy = (normalised[photo] * [fx, fy] + [cx, cy]) / [camera.width, camera.height]
@@ -168,12 +173,12 @@ def motion_points(
 
 
 def _group_features(features: np.ndarray, through: np.ndarray, reach: float) -> list[np.ndarray]:
-    """Group the features that photos see through into things; a lone one is likely a point at a wrong depth.
+    """Group features that violate free space by object; a lone one is likely a point at a wrong depth.
 
     Args:
         features: [N, 2] px.
-        through: [N] photos that see through each, by `seen_through`; empty if the photo was not checked.
-        reach: largest distance in px between neighbours of one thing.
+        through: [N], from `free_space_violation_counts`; empty if the photo was not checked.
+        reach: largest distance in px between neighbours of one object.
     """
     gone = np.flatnonzero(through >= MIN_THROUGH)
     if not len(gone):
@@ -181,7 +186,7 @@ def _group_features(features: np.ndarray, through: np.ndarray, reach: float) -> 
     links = cKDTree(features[gone]).query_pairs(reach, output_type="ndarray").T
     graph = coo_matrix((np.ones(links.shape[1]), links), (len(gone), len(gone)))
     group = connected_components(graph, directed=False)[1]
-    return [gone[group == k] for k in np.flatnonzero(np.bincount(group) >= MIN_OF_THING)]
+    return [gone[group == k] for k in np.flatnonzero(np.bincount(group) >= MIN_OBJECT_POINTS)]
 
 
 def write_motion(
@@ -206,7 +211,7 @@ def write_motion(
         train: names of the train photos.
         threads: pairs of photos at a time.
     """
-    matched, colmap_model = Matched.read(database), pycolmap.Reconstruction(str(model))
+    matched, colmap_model = MatchedPhotos.read(database), pycolmap.Reconstruction(str(model))
     matched.take_cameras(colmap_model)
     matched.load_relative_poses(relative_poses)
     undistorted = read_model(flat)
@@ -219,7 +224,7 @@ def write_motion(
         and number in colmap_model.images
         and colmap_model.images[number].num_points2D() == len(matched.features[k])
     }
-    through = seen_through(colmap_model, number_of)
+    through = free_space_violation_counts(colmap_model, number_of)
     points = motion_points(matched, matched.poses(colmap_model), train, pinholes, through)
     names = sorted((n for n in train if n in pinholes), key=natural_key)
     unfit = []

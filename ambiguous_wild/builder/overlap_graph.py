@@ -26,7 +26,7 @@ CLEAR = 0.1  # of the largest distance from the middle: photos nearer to it do n
 SHORTEST, LONGEST = 0.6, 1.8  # length of a link on the layout; 1 = a link with the median number of matches
 
 
-def graph_of(
+def overlap_graph(
     count: int,  # photos
     links: Iterable[Sequence[int]],
 ) -> nx.Graph:
@@ -178,7 +178,7 @@ def component_labels(count: int, pairs: Iterable[Sequence[int]]) -> np.ndarray:
     return np.argsort(order)[label]
 
 
-def lay_out(
+def graph_layout(
     count: int,  # photos, in the order of capture
     links: Sequence[Link],
 ) -> np.ndarray:  # [count, 2] x right, y up
@@ -188,7 +188,7 @@ def lay_out(
     stand side by side, photos without a link in rows below.
     """
     xy = np.zeros((count, 2))
-    components = connected_components(graph_of(count, links))
+    components = connected_components(overlap_graph(count, links))
     right = 0.0
     for component in components:
         if len(component) > 1:

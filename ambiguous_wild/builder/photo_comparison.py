@@ -166,10 +166,12 @@ def compare_photos(
     raw |= _all_raw_matches(features, more, "comparing photos that overlap with few", bar, jobs)
     enter_all(more, raw)
     share = float(np.mean(forward)) if forward else math.nan
-    return PhotoComparison(_solve(count, rows), graph.sum(axis=1), share, fixed, confirmed(matches), len(raw))
+    return PhotoComparison(
+        _solve(count, rows), graph.sum(axis=1), share, fixed, confirmed_matches(matches), len(raw)
+    )
 
 
-def confirmed(matches: Matches) -> Matches:
+def confirmed_matches(matches: Matches) -> Matches:
     """Leave out pairs of fewer than `MIN_OVERLAP_INLIERS` matches that no third photo confirms."""
     matched_features: dict[
         int, dict[int, dict[int, int]]

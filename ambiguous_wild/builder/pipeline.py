@@ -30,7 +30,7 @@ from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, verify_f
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO}
 
 
-class OtherSceneThere(AwError):
+class OutputExists(AwError):
     """The output is a damaged scene, or was built from something else; it may be replaced on request."""
 
 
@@ -168,13 +168,13 @@ def _existing(target: Path, stages: Stages, overwrite: bool) -> SceneRecord | No
             verify_files(target, info, quick=True)
         except AwError as error:
             if not overwrite:
-                raise OtherSceneThere(str(error)) from error
+                raise OutputExists(str(error)) from error
             refuse_foreign_files(target, {"scene.json", *info.get("files", {})})
             return None
         return cast(SceneRecord, info)
     if not overwrite:
-        changed = scene_record.what_changed(info.get("inputs", {}), stages.inputs)
-        raise OtherSceneThere(
+        changed = scene_record.changed_inputs(info.get("inputs", {}), stages.inputs)
+        raise OutputExists(
             f"{target} exists, built from other {changed}; pass --overwrite to replace it, or "
             "choose another -o"
         )

@@ -38,7 +38,7 @@ def joint_covariance(
 
     One photo whose lens nothing determines may leave all of them open: then the last ones have no deviation.
     """
-    found = None
+    joint = None
     for left_out in range(TRIES):
         adjusted = pycolmap.Reconstruction(model)
         config = pycolmap.BundleAdjustmentConfig()
@@ -53,11 +53,11 @@ def joint_covariance(
         if covariance is None or len(used) < 2:
             break
         deviations = _pose_deviations(covariance, adjusted, used)
-        if found is None or deviations:
-            found = JointCovariance(covariance, adjusted, deviations)
+        if joint is None or deviations:
+            joint = JointCovariance(covariance, adjusted, deviations)
         if deviations:
             break
-    return found
+    return joint
 
 
 def _pose_deviations(covariance: Any, model: Any, photos: Sequence[int]) -> dict[int, np.ndarray]:

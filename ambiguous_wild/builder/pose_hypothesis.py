@@ -1,4 +1,4 @@
-"""A pose that a photo may have, the evidence for it, and what is asked of it."""
+"""Pose hypotheses: their evidence, and the conditions for accepting one."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class PoseHypothesis:
         return self.area < LITTLE_AREA or self.coverage < LITTLE_COVERAGE
 
 
-def reason_against(best: PoseHypothesis, competing: PoseHypothesis, needed: int) -> str | None:
+def rejection_reason(best: PoseHypothesis, competing: PoseHypothesis, needed: int) -> str | None:
     """Return why the best hypothesis is not accepted; None if it is."""
     if not best.support:
         return "no placed photo agrees with it on a pose"

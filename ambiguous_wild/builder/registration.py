@@ -14,19 +14,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ambiguous_wild.builder.bundle_adjustment import adjustment_options, pipeline_options, plausible
-from ambiguous_wild.builder.matched import Matched, PointLookup
-from ambiguous_wild.builder.overlap_graph import bridges, connected_components, graph_of
+from ambiguous_wild.builder.bundle_adjustment import (
+    bundle_adjustment_options,
+    deterministic_pipeline_options,
+    plausible_distortion,
+)
+from ambiguous_wild.builder.matched import MatchedPhotos, PointLookup
+from ambiguous_wild.builder.overlap_graph import bridges, connected_components, overlap_graph
 from ambiguous_wild.builder.pose_covariance import UNSURE, JointCovariance, joint_covariance
 from ambiguous_wild.builder.pose_hypothesis import (
     AREA_NEW,
     MIN_SUPPORT,
     MIN_SUPPORT_NEW,
     PoseHypothesis,
-    reason_against,
+    rejection_reason,
 )
 from ambiguous_wild.builder.records import CameraFact
-from ambiguous_wild.builder.relative_poses import Pair, trace_of
+from ambiguous_wild.builder.relative_poses import Pair, rotation_trace
 from ambiguous_wild.builder.retrieval import FEW_PHOTOS
 from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.io.safe_pycolmap import pycolmap
@@ -57,7 +61,7 @@ STILL = 2e-3  # share of changed observations that ends them; share of moved pho
 class Registration:
     """Poses, points and cameras of a component of the pose graph, by the support of covisible photos."""
 
-    def __init__(self, matched: Matched, database: Path, model: Any, seed: int) -> None:
+    def __init__(self, matched: MatchedPhotos, database: Path, model: Any, seed: int) -> None:
         """Start from COLMAP's model; the verified pairs of the database will be replaced."""
         self.matched, self.database, self.model, self.seed = matched, database, model, seed
         self.pairs: list[list[Pair]] = [[] for _ in matched.ids]  # pairs of each photo
@@ -162,7 +166,7 @@ class Registration:
         photos = sorted(set(self.poses) - set(without))
         at = {photo: k for k, photo in enumerate(photos)}
         links = [(at[a], at[b], n) for (a, b), n in all_links.items() if a in at and b in at]
-        graph = graph_of(len(photos), links)
+        graph = overlap_graph(len(photos), links)
         weak = {pair for pair in bridges(graph) if not self._across_merge(*(photos[k] for k in pair))}
         graph.remove_edges_from(weak)
         self._cut_small_areas(graph, photos)
@@ -244,7 +248,7 @@ class Registration:
         # A photo with fewer points leaves all of them open.
         photos = [k for k in self.poses if self._observations(k) >= MIN_POINTS]
         ids = [self.matched.ids[k] for k in sorted(photos, key=self._observations, reverse=True)]
-        options = adjustment_options(self.matched.distorted, len(self.poses), final=True)
+        options = bundle_adjustment_options(self.matched.distorted, len(self.poses), final=True)
         return joint_covariance(self.model, ids, options)
 
     def _register_all(self, times_out: list[int], only_out: bool) -> bool:
@@ -258,7 +262,7 @@ class Registration:
             if best.pose is not None and best.support:
                 self.hypotheses[photo] = best.pose
             few = pose_now is None and best.area < AREA_NEW
-            reason = reason_against(best, competing, MIN_SUPPORT_NEW if few else MIN_SUPPORT)
+            reason = rejection_reason(best, competing, MIN_SUPPORT_NEW if few else MIN_SUPPORT)
             if reason is None and len(best.support) < MIN_SUPPORT_NEW:
                 self.provisional.add(photo)
             if reason is not None and self._unopposed(photo, best, competing, points):
@@ -367,7 +371,7 @@ class Registration:
         if not owners:
             return PoseHypothesis(None, frozenset(), 0.0)
         stack = np.array(turns).reshape(-1, 9)
-        alike = stack @ stack.T > trace_of(ALIKE_DEG)
+        alike = stack @ stack.T > rotation_trace(ALIKE_DEG)
         groups = [np.flatnonzero(row) for row in alike]
         largest = max(groups, key=lambda group: len({owners[k] for k in group}))
         area = self._area(photo, [rows[k] for k in largest])
@@ -429,7 +433,7 @@ class Registration:
             cache = pycolmap.DatabaseCache.create(db, pycolmap.DatabaseCacheOptions(load_all_images=True))
         finally:
             db.close()
-        options = pipeline_options(self.seed)
+        options = deterministic_pipeline_options(self.seed)
         options.triangulation.ignore_two_view_tracks = not pairs  # twice the points to begin training with
         model = pycolmap.Reconstruction()
         model.load(cache)
@@ -453,11 +457,11 @@ class Registration:
                 ADJUSTMENTS if careful else 1,
                 STILL,
                 options.mapper,
-                adjustment_options(matched.distorted, len(self.poses), final=careful),
+                bundle_adjustment_options(matched.distorted, len(self.poses), final=careful),
                 options.triangulation,
             )
         mapper.end_reconstruction(False)
-        if self.matched.distorted and not plausible(model):
+        if self.matched.distorted and not plausible_distortion(model):
             self.matched.distorted = False
             for camera in self.matched.cameras:
                 camera.params = [*camera.params[:3], 0.0]

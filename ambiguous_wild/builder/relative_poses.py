@@ -281,7 +281,7 @@ def _closed(rotations: np.ndarray, edges: np.ndarray, start: int) -> np.ndarray:
     around = np.einsum("tbxz,tazy->tabxy", second, first)
     trace = np.einsum("tabxy,tcxy->tabc", around, direct)
     # Relative poses that do not exist are NaN, which is never larger.
-    return np.argwhere(trace > trace_of(CYCLE_DEG)) + np.array((start, 0, 0, 0))
+    return np.argwhere(trace > rotation_trace(CYCLE_DEG)) + np.array((start, 0, 0, 0))
 
 
 def _vote(votes: np.ndarray, prior: np.ndarray, edges: np.ndarray, closed: np.ndarray) -> np.ndarray:
@@ -377,7 +377,7 @@ def _rotation(ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwi
         return otherwise
     stack, weight, owner = np.array(turns), np.array(weights), np.unique(owners, return_inverse=True)[1]
     flat = stack.reshape(-1, 9)
-    alike = flat @ flat.T > trace_of(CONSISTENT_DEG)
+    alike = flat @ flat.T > rotation_trace(CONSISTENT_DEG)
     best = np.zeros((len(flat), owner.max() + 1))
     for column in range(best.shape[1]):
         mine = owner == column
@@ -389,9 +389,9 @@ def _rotation(ends: Sequence[_End], rotations: Mapping[int, np.ndarray], otherwi
 
 def _alike(rotations: np.ndarray, wanted: np.ndarray, angle_deg: float) -> np.ndarray:
     """Tell which rotations [N, 3, 3] differ by less than an angle from the wanted one: [N] bool."""
-    return (rotations * wanted).sum(axis=(1, 2)) > trace_of(angle_deg)
+    return (rotations * wanted).sum(axis=(1, 2)) > rotation_trace(angle_deg)
 
 
-def trace_of(angle_deg: float) -> float:
+def rotation_trace(angle_deg: float) -> float:
     """Return the trace of a rotation by an angle."""
     return 1.0 + 2.0 * float(np.cos(np.radians(angle_deg)))

@@ -39,7 +39,7 @@ _ROWS = 256  # photos compared at a time
 _ROUNDS = 12  # of k-means
 
 
-def embed(
+def vlad_vectors(
     read: Callable[[str], np.ndarray],  # name -> [F, 128] uint8
     names: Sequence[str],
     seed: int = 0,
@@ -51,7 +51,7 @@ def embed(
     for name in names:
         rows = read(name)[:MAX_DESCRIPTORS]
         if len(rows):
-            sample.append(unit(rows[generator.permutation(len(rows))[:share]]))
+            sample.append(unit_descriptors(rows[generator.permutation(len(rows))[:share]]))
     vectors = np.zeros((len(names), WORDS * 128), np.float32)
     if not sample:
         return vectors
@@ -81,7 +81,7 @@ def _nearest(rows: np.ndarray, words: np.ndarray) -> np.ndarray:
 def _vlad(rows: np.ndarray, words: np.ndarray) -> np.ndarray:
     out = np.zeros((WORDS, 128), np.float32)
     if len(rows):
-        units = unit(rows)
+        units = unit_descriptors(rows)
         nearest = _nearest(units, words)
         for word in np.unique(nearest):
             out[word] = (units[nearest == word] - words[word]).sum(axis=0)
@@ -158,12 +158,12 @@ def retrieval_pairs(
         listed = [(a, b) for a in asking for b in everyone if a != b]
     else:
         far_share, near = FAR, (SHORTLIST - 1) * similar
-        listed = most_similar(embed(read, names, seed), asking, everyone, near, similar)
+        listed = most_similar(vlad_vectors(read, names, seed), asking, everyone, near, similar)
     pairs |= best_pairs(shared_features(read, names, listed, jobs), dict.fromkeys(asking, similar), far_share)
     return [(names[a], names[b]) for a, b in sorted(pairs)]
 
 
-def pairs_of_tests(
+def test_set_pairs(
     vectors: np.ndarray,  # [N, D]
     names: Sequence[str],
     test_names: set[str],
@@ -180,7 +180,7 @@ def sequential_pairs(names: list[str], test_names: set[str]) -> list[tuple[str, 
     """Pair neighbours in the given order, and photos 2^k further on.
 
     Photos of a separate test set are not part of the walk: their neighbours by name are other test photos.
-    `pairs_of_tests` finds theirs.
+    `test_set_pairs` finds theirs.
 
     Args:
         names: photos in the order of capture.
@@ -201,14 +201,14 @@ def shared_features(
     jobs: int,
 ) -> dict[tuple[int, int], int]:
     """Count the matches of each pair (a, b) with a < b; the result does not depend on `jobs`."""
-    units = [unit(read(name)[:LARGEST]) for name in names]
+    units = [unit_descriptors(read(name)[:LARGEST]) for name in names]
     todo = sorted({(min(a, b), max(a, b)) for a, b in pairs if a != b})
     with ThreadPoolExecutor(jobs) as pool:
         counts = pool.map(lambda pair: _matches(units[pair[0]], units[pair[1]]), todo)
         return dict(zip(todo, counts))
 
 
-def unit(rows: np.ndarray) -> np.ndarray:
+def unit_descriptors(rows: np.ndarray) -> np.ndarray:
     """Scale descriptors [F, 128] to float32 of unit length."""
     values = rows.astype(np.float32)
     return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)

@@ -11,7 +11,7 @@ from typing import cast
 
 import numpy as np
 
-from ambiguous_wild.builder.fixed_to_camera import words_of
+from ambiguous_wild.builder.fixed_to_camera import area_text
 from ambiguous_wild.builder.keep_masks import mask_warnings
 from ambiguous_wild.builder.records import (
     BuildInputs,
@@ -229,7 +229,7 @@ def fixed_lines(fixed: Sequence[FixedRecord]) -> list[str]:
     """Return a line for each mask of something that is fixed to the camera."""
     lines = []
     for area in fixed:
-        what = words_of(area["share"], area["where"])
+        what = area_text(area["share"], area["where"])
         what += f" of {area['width']}x{area['height']}" if len(fixed) > 1 else ""
         masked = counted(len(area["photos"]), "photo")
         lines.append(
@@ -238,13 +238,13 @@ def fixed_lines(fixed: Sequence[FixedRecord]) -> list[str]:
     return lines
 
 
-def sfm_share(info: SceneRecord) -> float:
+def sfm_time_share(info: SceneRecord) -> float:
     """Return the share of the build's time that COLMAP took, 0 to 1."""
     seconds = info["seconds"]
     return sum(seconds.get(s, 0.0) for s in SFM_STAGES) / max(sum(seconds.values()), 1e-9)
 
 
-def what_changed(
+def changed_inputs(
     old: Mapping[str, object],  # `BuildInputs`, perhaps of another version
     new: BuildInputs,
 ) -> str:

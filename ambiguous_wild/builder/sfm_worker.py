@@ -29,15 +29,15 @@ import numpy as np
 
 from ambiguous_wild.builder.fixed_to_camera import FIXED, FixedArea, find_fixed, moving_matches
 from ambiguous_wild.builder.mapping import run_mapping, triangulate_known
-from ambiguous_wild.builder.matched import Matched, largest_component
+from ambiguous_wild.builder.matched import MatchedPhotos, largest_component
 from ambiguous_wild.builder.records import FixedMask
 from ambiguous_wild.builder.retrieval import (
     PAIRS,
     RELATIVE_POSES,
-    embed,
-    pairs_of_tests,
     retrieval_pairs,
     sequential_pairs,
+    test_set_pairs,
+    vlad_vectors,
 )
 from ambiguous_wild.builder.sfm import (
     FeatureJob,
@@ -209,9 +209,9 @@ def run_matches(job: MatchJob) -> None:
         _replace_in_names(database, {escaped: plain for plain, escaped in _ESCAPED.items()})
     if job["focals"] is None:  # poses are known: triangulation takes the matches that fit them
         return
-    matched = Matched.read(database)
+    matched = MatchedPhotos.read(database)
     if job["photos"] and _take_out_fixed(job, matched):
-        matched = Matched.read(database)
+        matched = MatchedPhotos.read(database)
     matched.find_focals(job["focals"], job["jobs"])
     consistent = matched.find_relative_poses(job["jobs"])
     matched.write_consistent(database, consistent)
@@ -229,7 +229,7 @@ def _replace_in_names(database: Path, new_of: Mapping[str, str]) -> None:
             db.execute("UPDATE images SET name = replace(name, ?1, ?2) WHERE instr(name, ?1)", pair)
 
 
-def _take_out_fixed(job: MatchJob, matched: Matched) -> bool:
+def _take_out_fixed(job: MatchJob, matched: MatchedPhotos) -> bool:
     """Remove the matches of what is fixed to the camera from the database; tell whether there was any.
 
     Writes `FIXED` and the keep masks beside the database. What an earlier attempt found stays.
@@ -283,8 +283,8 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
             return np.asarray(database.read_descriptors(numbers[name]).data)
 
         if sequential:
-            vectors = embed(read, job["names"], job["seed"])
-            pairs = {*sequential_pairs(job["names"], tests), *pairs_of_tests(vectors, job["names"], tests)}
+            vectors = vlad_vectors(read, job["names"], job["seed"])
+            pairs = {*sequential_pairs(job["names"], tests), *test_set_pairs(vectors, job["names"], tests)}
             return sorted(pairs)
         return retrieval_pairs(
             read,
@@ -310,7 +310,7 @@ def run_triangulation(job: TriangulationJob) -> None:
 
 def run_relative_poses(job: RelativePoseJob) -> None:
     """Find the relative poses of every matched pair, with known cameras."""
-    matched = Matched.read(Path(job["database"]))
+    matched = MatchedPhotos.read(Path(job["database"]))
     matched.take_cameras(pycolmap.Reconstruction(job["model"]))
     matched.find_relative_poses(job["jobs"])
     matched.save_relative_poses(Path(job["output"]))

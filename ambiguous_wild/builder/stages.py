@@ -16,12 +16,12 @@ from ambiguous_wild.builder.keep_masks import (
     add_fixed,
     alpha_mask,
     find_masks,
-    lay_out_masks,
     mask_hashes,
     mask_warnings,
+    write_colmap_masks,
 )
 from ambiguous_wild.builder.known_poses import read_known_cameras
-from ambiguous_wild.builder.map_drawing import draw_built
+from ambiguous_wild.builder.map_drawing import draw_scene_map
 from ambiguous_wild.builder.moving_features import write_motion
 from ambiguous_wild.builder.pose_hypothesis import TWO_POSES
 from ambiguous_wild.builder.progress import Bar
@@ -174,7 +174,7 @@ class Stages:
         drawn = work.run(
             "map",
             [inputs["versions"], mapping.key, split.test],
-            lambda f: draw_built(
+            lambda f: draw_scene_map(
                 f, model, mapping.facts, {photo.name: photo.source for photo in photos}, split.test
             ),
         )
@@ -237,7 +237,7 @@ class Stages:
         elif all(alpha_mask(root, photo) is None for photo in photos):
             return None
         key = [screened.key, mask_hashes(mask_files)]
-        return work.run("masks", key, lambda f: lay_out_masks(f, mask_files, photos, root))
+        return work.run("masks", key, lambda f: write_colmap_masks(f, mask_files, photos, root))
 
     def _fixed_masks(
         self,

@@ -176,7 +176,10 @@ def command(
         say(line, out=True)
     if not result.up_to_date:
         spent = ", ".join(f"{stage} {s:.1f}" for stage, s in info["seconds"].items())
-        say(f"{result.seconds:.1f} s ({spent}; COLMAP {100 * scene_record.sfm_share(info):.0f} %)", out=True)
+        say(
+            f"{result.seconds:.1f} s ({spent}; COLMAP {100 * scene_record.sfm_time_share(info):.0f} %)",
+            out=True,
+        )
     say(verdict, out=True)
 
 

@@ -252,18 +252,18 @@ def _gpu(torch: Probe) -> list[SystemCheck]:
     """Check the GPU, with the same messages as `--device`."""
     if torch.facts is None:
         return [_optional("torch cuda", False, torch.error, _install_again("--no-deps torch"))]
-    facts = readiness.look(torch.facts)
+    facts = readiness.gpu_facts(torch.facts)
     driver = facts.driver
     checks = [
         _optional(
             "nvidia driver", driver is not None, driver or "no nvidia-smi; the CPU is used", _driver_install()
         ),
-        _part("torch cuda", ", ".join(torch.facts["names"]), readiness.no_cuda(facts)),
-        _part("gsplat", facts.gsplat or "", readiness.no_gsplat(facts)),
+        _part("torch cuda", ", ".join(torch.facts["names"]), readiness.cuda_problem(facts)),
+        _part("gsplat", facts.gsplat or "", readiness.gsplat_problem(facts)),
     ]
     if facts.gsplat and facts.torch["cuda"]:
         state = "in the wheel" if facts.prebuilt else "compiled by the first run, which takes minutes longer"
-        checks.append(_part("gsplat kernels", state, readiness.no_compiler(facts)))
+        checks.append(_part("gsplat kernels", state, readiness.compiler_problem(facts)))
     return checks
 
 
@@ -273,7 +273,7 @@ def _driver_install() -> str:
     return "# if this machine has an NVIDIA GPU, install its driver: https://www.nvidia.com/drivers"
 
 
-def _part(name: str, fine: str, lack: readiness.Lack | None) -> SystemCheck:
+def _part(name: str, fine: str, lack: readiness.MissingDependency | None) -> SystemCheck:
     if lack is None:
         return _optional(name, True, fine)
     return _optional(name, False, lack.what, pastable(lack.fix))
@@ -346,13 +346,13 @@ def _metrics() -> list[SystemCheck]:
         missing = lpips.missing_weights(metric)
         detail = f"weights missing: {', '.join(missing)}" if missing else "weights found"
         checks.append(
-            _optional(metric, not missing, detail, weight_registry.fix(*missing) if missing else "")
+            _optional(metric, not missing, detail, weight_registry.download_hint(*missing) if missing else "")
         )
     return checks
 
 
 def _git() -> SystemCheck:
-    version = readiness.first_line("git", "--version")
+    version = readiness.first_output_line("git", "--version")
     fix = _system_install("git", "https://git-scm.com/downloads")
     return _optional("git", version is not None, version or "not installed", fix)
 

@@ -262,9 +262,9 @@ def choose_device(device: str) -> str:
     """
     if device == "cpu":
         return "cpu"
-    from ambiguous_wild.splat.readiness import choose
+    from ambiguous_wild.splat.readiness import choose_device
 
-    return choose(device, say)
+    return choose_device(device, say)
 
 
 def prepare_cpu(threads: int | None) -> None:

@@ -113,7 +113,7 @@ def _check_overwrite(path: Path, probe: bool) -> None:
 def table(plan: EffectsPlan) -> list[str]:
     """Return the plan as lines: a table, and a sentence for each effect."""
     columns = min(line_width() or COLUMNS, COLUMNS)
-    head = ("effect", "decision", "measured", "limit", "gain on held-back pixels", "ms/iteration")
+    head = ("effect", "decision", "measured", "limit", "gain on held-out pixels", "ms/iteration")
     rows = [head, *(_row(d) for d in plan.decisions)]
     shown = [k for k in range(len(head)) if any(row[k] != NOTHING for row in rows[1:])]
     rows = [tuple(row[k] for k in shown) for row in rows]

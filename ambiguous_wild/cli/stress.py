@@ -120,12 +120,15 @@ def _devices(wanted: str) -> list[str]:
 
 
 def _replay(run: Path) -> None:
-    from ambiguous_wild.harness.replay import replay
+    from ambiguous_wild.harness.replay import replay_run
 
     prepare_cpu(None)
-    result = replay(run)
+    result = replay_run(run)
     say(f"reported: {result.reported}", out=True)
-    say(f"replayed from iteration {result.started_at}: {result.found or 'all values are finite'}", out=True)
-    if not result.same:
+    say(
+        f"replayed from iteration {result.started_at}: {result.reproduced or 'all values are finite'}",
+        out=True,
+    )
+    if not result.matches:
         say("the replay differs from the report: check the version, the machine and the plugins")
         sys.exit(1)

@@ -185,10 +185,10 @@ def _seen(option: click.Option, word: str, folder: Path, here: Path) -> list[str
     if option.name not in ("methods", "mask"):
         return [word]
     from ambiguous_wild.harness.benchmark import split_methods
-    from ambiguous_wild.methods.graft import with_files
+    from ambiguous_wild.methods.graft import replace_reference_files
 
     names = split_methods(word, folder) if option.multiple else [word]
-    return [with_files(name, moved) for name in names]
+    return [replace_reference_files(name, moved) for name in names]
 
 
 def is_plan(effects: str) -> bool:

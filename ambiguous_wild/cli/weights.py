@@ -74,8 +74,8 @@ def get_command(names: tuple[str, ...], again: bool, as_json: bool) -> None:
     """
     from ambiguous_wild.vision import weight_download, weight_registry
 
-    wanted = weight_registry.chosen(names)
-    places = weight_download.get(wanted, say, again)
+    wanted = weight_registry.select_weights(names)
+    places = weight_download.download_weights(wanted, say, again)
     if as_json:
         rows = [{"name": w.name, "where": str(place)} for w, place in zip(wanted, places)]
         click.echo(json.dumps(rows, indent=2))
@@ -95,7 +95,9 @@ def check_command(names: tuple[str, ...], as_json: bool) -> None:
 
     every = weight_registry.KNOWN + weight_registry.OTHER_SIZES
     wanted = (
-        weight_registry.chosen(names) if names else [w for w in every if weight_registry.where(w) is not None]
+        weight_registry.select_weights(names)
+        if names
+        else [w for w in every if weight_registry.weight_path(w) is not None]
     )
     verdicts = []
     for weight in wanted:

@@ -46,7 +46,7 @@ _KEYS = tuple(m.key for m in METRICS)
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedVariant:
     """A variant and its cells, scene by scene and seed by seed."""
 
     group: str
@@ -57,14 +57,14 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Study:
+class AblationStudy:
     """An ablation study, ready to run."""
 
     method: str
     groups: tuple[Group, ...]
     settings: tuple[str, ...]  # that replace defaults in every row
     default: tuple[Cell, ...]
-    rows: tuple[Planned, ...]  # in the order of the groups; each group begins with the default
+    rows: tuple[PlannedVariant, ...]  # in the order of the groups; each group begins with the default
 
     @property
     def note(self) -> str:
@@ -100,7 +100,7 @@ def plan_study(
     settings: Sequence[str] = (),
     device: str = "cpu",
     factor: int | None = None,
-) -> Study:
+) -> AblationStudy:
     """Plan every variant on every scene with every seed; nothing is trained.
 
     A variant whose method, option or weights are missing becomes a row with the reason. Variants with equal
@@ -130,7 +130,7 @@ def plan_study(
     names = _Names(entry, default[0].options, every)
     rows = []
     for group in chosen:
-        rows.append(Planned(group.name, Variant(DEFAULT), default))
+        rows.append(PlannedVariant(group.name, Variant(DEFAULT), default))
         for variant in group.variants:
             try:
                 if variant.method:
@@ -141,23 +141,23 @@ def plan_study(
                     if given or variant.settings:  # without settings the run has the method's own name
                         of_graft = variant.settings if host else ()
                         cells = _renamed(cells, variant.method, of_graft, folder_name(method, group, variant))
-                    rows.append(Planned(group.name, variant, tuple(cells)))
+                    rows.append(PlannedVariant(group.name, variant, tuple(cells)))
                     continue
                 options = names.options(variant)
                 _check_features(variant)
             except AwError as error:
-                rows.append(Planned(group.name, variant, (), missing=str(error)))
+                rows.append(PlannedVariant(group.name, variant, (), missing=str(error)))
                 continue
             name = names.of[config_hash(options)]
             renamed = dataclasses.replace(entry, name=name)
             cells = [dataclasses.replace(cell, method=renamed, options=options) for cell in default]
             own_name = folder_name(method, group, variant)
             same = "" if name == own_name else DEFAULT if name == method else name.partition("@")[2]
-            rows.append(Planned(group.name, variant, tuple(cells), same_as=same))
-    return Study(method, chosen, tuple(settings), default, tuple(rows))
+            rows.append(PlannedVariant(group.name, variant, tuple(cells), same_as=same))
+    return AblationStudy(method, chosen, tuple(settings), default, tuple(rows))
 
 
-def as_continued_study(study: Study, output: Path) -> Study:
+def as_continued_study(study: AblationStudy, output: Path) -> AblationStudy:
     """Return the study with each cell as the continuation of its run in OUTPUT, see `as_continued`."""
     cells = {folder: as_continued(c, folder) for c in study.cells for folder in [cell_folder(output, c)]}
 
@@ -182,7 +182,7 @@ def _settings_of(variant: Variant, method: str, settings: Sequence[str]) -> list
     return [*shared, *nets, *(f"{method}.{text}" for text in variant.settings)]
 
 
-def earlier_groups(study: Study, output: Path) -> list[str]:
+def earlier_groups(study: AblationStudy, output: Path) -> list[str]:
     """Return the groups that an earlier report in the folder has and this study lacks.
 
     The list is empty if the report is damaged, or of another scene, seed, length or setting.
@@ -288,7 +288,7 @@ def read_outcomes(cells: Sequence[Cell], output: Path) -> list[VariantResult]:
     return outcomes
 
 
-def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
+def report(study: AblationStudy, output: Path, made_by: str = "") -> StudyReport:
     """Return the study as plain data: for each variant its values, differences and runs.
 
     Args:
@@ -312,7 +312,7 @@ def report(study: Study, output: Path, made_by: str = "") -> StudyReport:
     }
 
 
-def _row(row: Planned, outcomes: list[VariantResult], default: list[VariantResult]) -> VariantRow:
+def _row(row: PlannedVariant, outcomes: list[VariantResult], default: list[VariantResult]) -> VariantRow:
     failed = [o for o in outcomes if o.result is None]
     status: Literal["ok", "failed", "missing"] = "missing" if row.missing else "failed" if failed else "ok"
     reason = row.missing or "; ".join(dict.fromkeys(f"{o.scene}, seed {o.seed}: {o.error}" for o in failed))
@@ -344,7 +344,7 @@ def _run_row(o: VariantResult) -> Facts:
     return row | {"untimed": o.untimed} | {key: o.value(key) for key in _KEYS}
 
 
-def _networks(row: Planned) -> list[str]:
+def _networks(row: PlannedVariant) -> list[str]:
     """Return the features and instances of a variant that is another method."""
     if not row.variant.method or not row.cells:
         return []
@@ -352,7 +352,7 @@ def _networks(row: Planned) -> list[str]:
     return [f"{key}={options[key]}" for key in BACK_ENDS if key in options]
 
 
-def _default_value(study: Study, settings: Sequence[Sequence[str]]) -> list[str]:
+def _default_value(study: AblationStudy, settings: Sequence[Sequence[str]]) -> list[str]:
     """Return KEY=VALUE of the default where the variants are values of this one option."""
     keys = {setting.partition("=")[0] for of in settings for setting in of}
     options = flatten(to_plain(study.default[0].options))

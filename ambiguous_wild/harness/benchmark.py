@@ -25,7 +25,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness.callbacks import Callbacks as Callbacks
 from ambiguous_wild.harness.callbacks import Engine as Engine
 from ambiguous_wild.harness.callbacks import Lines as Lines
-from ambiguous_wild.harness.measures import load_metrics, try_own
+from ambiguous_wild.harness.measures import check_user_metrics, load_metrics
 from ambiguous_wild.harness.session import Session
 
 if TYPE_CHECKING:
@@ -231,13 +231,13 @@ def bench(
         from ambiguous_wild.harness.external_runs import check_program
         from ambiguous_wild.harness.grid import (
             cell_folder,
+            cells_to_run,
             check_grafts,
-            expected_line,
-            grouped,
+            expand_budgets,
+            expected_time_line,
             plan_cells,
             run_cells,
             try_recipes,
-            unfinished,
         )
         from ambiguous_wild.harness.job import read_sources
         from ambiguous_wild.harness.training import check_passes
@@ -268,7 +268,7 @@ def bench(
             )
             for wanted in dict.fromkeys(choices)
         }
-        cells = grouped(planned, budgets_s)
+        cells = expand_budgets(planned, budgets_s)
         if corrections is not None:
             cells = with_corrections(cells, Path(corrections))
         if overwrite == "longer":
@@ -276,21 +276,21 @@ def bench(
         warnings = check_grafts(cells)
         for cell in {cell.method.name: cell for cell in cells}.values():
             check_passes(cell)
-        to_run = [] if engine.remote else unfinished(cells, out, overwrite)
+        to_run = [] if engine.remote else cells_to_run(cells, out, overwrite)
         for cell in {cell.method.name: cell for cell in to_run}.values():
             check_program(cell)
         to_train = [cell for cell in to_run if cell.method.program is None]
         for line in try_recipes(to_train):
             say(line)
         for cell in {cell.scene_id: cell for cell in to_run}.values():
-            try_own(cell.scene)
+            check_user_metrics(cell.scene)
         check_output(out / "run")  # before half a minute of compiling
         for line in [*_remarks(cells), *warnings]:
             say(line)
         if used_device == "cpu" and not engine.remote and any(cell.method.program is None for cell in cells):
             prepare_cpu(threads, say)
             if to_train and iterations is None and not budgets_s:
-                say(expected_line(to_train))
+                say(expected_time_line(to_train))
         one_by_one = session.in_process(cells)
         callbacks.planned(cells, one_by_one)
         options = RunOptions(out / ".cache" if cache is None else Path(cache), overwrite, pictures)
@@ -367,10 +367,10 @@ def _check_effects(
     methods: Collection[MethodEntry],
 ) -> None:
     """Raise AwError for an unknown effect, or effects or a plan that no method would use."""
-    from ambiguous_wild.harness.chosen_effects import EXTERNAL_NO_EFFECTS, check_wanted, takes_effects
+    from ambiguous_wild.harness.chosen_effects import EXTERNAL_NO_EFFECTS, parse_effects, takes_effects
 
     for wanted in choices:
-        check_wanted(wanted)
+        parse_effects(wanted)
         if wanted not in ("auto", "none") and not any(map(takes_effects, methods)):
             names = ", ".join(method.name for method in methods)
             raise AwError(
@@ -407,9 +407,9 @@ def _rescore_hint(report: BenchReport, metrics: Sequence[PathLike] = ()) -> str:
     kept = [r.result for r in report.runs if r.outcome in ("kept", "skipped") and r.result is not None]
     if not metrics and not any(result["missing"] for result in kept):
         return ""
-    from ambiguous_wild.harness.store import could_be_measured
+    from ambiguous_wild.harness.store import computable_metrics
 
-    names = could_be_measured(kept)
+    names = computable_metrics(kept)
     command = shlex.join(["aw", "rescore", str(report.output), *(f"--metric-file={f}" for f in metrics)])
     return (
         f"runs that were kept lack {', '.join(names)}, which can be measured now: {command}" if names else ""

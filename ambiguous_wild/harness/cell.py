@@ -24,7 +24,7 @@ from ambiguous_wild.core.config import config_hash, flatten, to_plain
 from ambiguous_wild.core.errors import installed
 from ambiguous_wild.core.machine import usable_cores
 from ambiguous_wild.core.processes import own_commit
-from ambiguous_wild.harness.chosen_effects import Chosen, mixed_tests, scene_protocol
+from ambiguous_wild.harness.chosen_effects import ChosenEffects, mixed_tests, scene_protocol
 from ambiguous_wild.harness.command_lines import bench_command, length_options, length_text, option_text
 from ambiguous_wild.harness.measures import ImageRow, records
 from ambiguous_wild.harness.result_file import (
@@ -80,10 +80,10 @@ def environment(device: str) -> Environment:
         "device": device,
         "packages": {name: installed(name) for name in PACKAGES},
     }
-    if revision := commit():
+    if revision := package_commit():
         facts["commit"] = revision
     if device.startswith("cuda"):
-        from ambiguous_wild.splat.gsplat_seam import max_alpha
+        from ambiguous_wild.splat.gsplat_calls import max_alpha
 
         facts["gpu"] = torch.cuda.get_device_name(device)
         facts["gsplat_max_alpha"] = max_alpha(device)  # differs between its sources
@@ -164,7 +164,7 @@ class Cell:
     scene_id: str  # sha256 of what the scene was built from, see `scene_identity`
     train: TrainConfig
     device: str = "cpu"
-    chosen: Chosen = field(default_factory=Chosen)  # optional effects, and the reasons for them
+    chosen: ChosenEffects = field(default_factory=ChosenEffects)  # optional effects, and the reasons for them
     protocol: Protocol = "full"  # "half": measured on the right half, colour effects fitted on the left
     start: StartFile | None = None  # what it starts from instead of the scene's points
     corrections: CorrectionsFile | None = None  # masks corrected by hand
@@ -310,7 +310,7 @@ def provenance(cell: Cell) -> Provenance:
     return {
         "environment": environment(cell.device),
         "code_hash": code_hash(),
-        "reproduce": reproduce(cell),
+        "reproduce": reproduce_command(cell),
     }
 
 
@@ -326,12 +326,12 @@ def code_hash() -> str:
 
 
 @cache
-def commit() -> str:
+def package_commit() -> str:
     """Return the commit of the package, see `own_commit`; asked once a process."""
     return own_commit()
 
 
-def reproduce(cell: Cell) -> str:
+def reproduce_command(cell: Cell) -> str:
     """Return the command that makes this result again, whatever the defaults of a later version are.
 
     It names no output folder (-o, by default runs/).
@@ -391,11 +391,11 @@ def _plugins(method: MethodEntry) -> list[Path]:
     methods = all_methods()
     members = [methods[name] for _, name in method.slots if name in methods] or [method]
     # a reference is no plugin: its file need not call register
-    files = [file_of(member) for member in members if not member.given_as]
+    files = [method_file(member) for member in members if not member.given_as]
     return [path for path in dict.fromkeys(files) if path is not None]
 
 
-def file_of(method: MethodEntry) -> Path | None:
+def method_file(method: MethodEntry) -> Path | None:
     """Return the file of a user's own method; None for every other."""
     if method.given_as:
         return reference_file(method.given_as)

@@ -22,7 +22,7 @@ from ambiguous_wild.harness.cell import (
     Overwrite,
     RunOptions,
     environment,
-    file_of,
+    method_file,
     provenance,
 )
 from ambiguous_wild.harness.external_runs import run_program
@@ -78,11 +78,13 @@ def is_finished(folder: Path) -> bool:
     return True
 
 
-def left_alone(folder: Path, overwrite: Overwrite, config: RunConfig) -> Literal["kept", "skipped"] | None:
-    """Return the outcome of a run that need not be made: "kept" or "skipped"; None if it must be made."""
+def existing_outcome(
+    folder: Path, overwrite: Overwrite, config: RunConfig
+) -> Literal["kept", "skipped"] | None:
+    """Return the outcome of an earlier run, "kept" or "skipped"; None if the run must be made."""
     if overwrite == "never":
         return "skipped" if folder.exists() else None
-    if not is_finished(folder) or made_anew(folder, overwrite, config) or _continues(folder, config):
+    if not is_finished(folder) or replaces_earlier(folder, overwrite, config) or _continues(folder, config):
         return None
     return "kept"
 
@@ -93,7 +95,7 @@ def _continues(folder: Path, config: RunConfig) -> bool:
     return bool(earlier) and read_config(folder).get("config_hash") == earlier[-1]["config_hash"]
 
 
-def made_anew(folder: Path, overwrite: Overwrite, config: RunConfig) -> bool:
+def replaces_earlier(folder: Path, overwrite: Overwrite, config: RunConfig) -> bool:
     """Return whether an earlier run in the folder is replaced: always, or where the method's file changed."""
     if overwrite != "changed":
         return overwrite == "always"
@@ -132,7 +134,7 @@ def check_folder(cell: Cell, folder: Path, overwrite: Overwrite) -> bool:
         AwError: the folder holds foreign files, or a run of another configuration.
     """
     _refuse_foreign_folder(folder)
-    anew = made_anew(folder, overwrite, cell.config)
+    anew = replaces_earlier(folder, overwrite, cell.config)
     if not anew:
         refuse_other_config(folder, cell)
     return anew
@@ -173,7 +175,7 @@ def describe_change(key: str, before: Flat, now: Flat, cell: Cell) -> str:
 
 
 def _file_name(cell: Cell) -> str:
-    return getattr(file_of(cell.method), "name", cell.method.name)
+    return getattr(method_file(cell.method), "name", cell.method.name)
 
 
 def _hint_for_weights(cell: Cell, keys: Sequence[str], before: Flat) -> str:
@@ -228,10 +230,10 @@ def refuse_other_config(folder: Path, cell: Cell) -> None:
     now = flatten(dict(cell.config))
     keys = different_keys(before, now)
     changes = ", ".join(describe_change(key, before, now, cell) for key in keys[:4]) or "its hash"
-    how = "changed" if made_anew(folder, "changed", cell.config) else "always"
-    asked = before.get("train.iterations")
+    how = "changed" if replaces_earlier(folder, "changed", cell.config) else "always"
+    iterations = before.get("train.iterations")
     budgets = before.get("train.budget_s"), cell.train.budget_s
-    shorter = budgets == (None, None) and isinstance(asked, int) and cell.train.iterations < asked
+    shorter = budgets == (None, None) and isinstance(iterations, int) and cell.train.iterations < iterations
     may = keys and all(map(may_continue, keys)) and not shorter
     longer = ", continue it with --overwrite longer" if may else ""
     raise AwError(

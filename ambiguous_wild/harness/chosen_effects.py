@@ -66,8 +66,8 @@ def mixed_tests(scene: Scene) -> str:
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """The effects of one run, and the request and plan that they come from."""
+class ChosenEffects:
+    """The effects of one run, with the request and the plan behind them."""
 
     effects: tuple[str, ...] = ()
     asked: str = ""  # empty: no effects were asked for, and no effects.json is written
@@ -83,7 +83,7 @@ class Chosen:
         write_json(path, {"schema": 1, "asked": self.asked, "effects": list(self.effects), "plan": plan})
 
 
-def check_wanted(wanted: str) -> tuple[str, ...]:
+def parse_effects(wanted: str) -> tuple[str, ...]:
     """Return the effects that the text names, in the order in which they act; none for "auto" and "none".
 
     Raises:

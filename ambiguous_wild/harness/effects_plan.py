@@ -55,7 +55,7 @@ class Evidence:
     outward: float = math.nan  # spread of the places that train cameras look at, over that of the cameras
 
 
-def measure(scene: Scene, photos: Iterable[np.ndarray]) -> Evidence:
+def measure_evidence(scene: Scene, photos: Iterable[np.ndarray]) -> Evidence:
     """Measure all evidence.
 
     Args:
@@ -75,7 +75,7 @@ def measure(scene: Scene, photos: Iterable[np.ndarray]) -> Evidence:
         view_dependence=_typical_spread(in_codes),
         observations=len(colours.point),
         photos=len(scene.train),
-        outward=outward(scene),
+        outward=outward_ratio(scene),
     )
 
 
@@ -112,7 +112,7 @@ def sampling_ratio(scene: Scene) -> float:
     return float(high / low)
 
 
-def outward(scene: Scene) -> float:
+def outward_ratio(scene: Scene) -> float:
     """Return the spread of the places that train cameras look at, over that of the cameras themselves.
 
     It is near 0 for cameras around an object, 1 for cameras that look the same way, and large for cameras in
@@ -205,7 +205,7 @@ def _typical_spread(variances: np.ndarray) -> float:
     return float(np.sqrt(max(np.median(variances), 0.0))) if len(variances) >= 10 else float("nan")
 
 
-Answer = Literal["on", "off", "unknown"]
+DecisionState = Literal["on", "off", "unknown"]
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ class Decision:
     value: float  # NaN: it could not be measured
     threshold: float
     unit: str  # empty: another decision decides
-    decision: Answer
+    decision: DecisionState
     why: str
     how: str  # the option that switches the effect
     cost_ms: float | None = None  # extra ms per iteration; None: not measured
@@ -267,7 +267,7 @@ class EffectsPlan:
         return replace(self, decisions=tuple(lines))
 
 
-def answer(value: float, threshold: float) -> Answer:
+def decision_for(value: float, threshold: float) -> DecisionState:
     """Return "on" from the threshold up, "off" below it, "unknown" for NaN."""
     if math.isnan(value):
         return "unknown"
@@ -278,14 +278,14 @@ def decide(scene: str, evidence: Evidence) -> EffectsPlan:
     """Return the plan that follows from the evidence alone."""
     shine = 0.0 if math.isnan(evidence.view_dependence) else OF_SHINE * evidence.view_dependence
     by_place = evidence.appearance - min(shine, evidence.appearance)  # NaN stays NaN
-    appearance = answer(by_place, APPEARANCE)
-    exposure = answer(evidence.exposure, EXPOSURE)
+    appearance = decision_for(by_place, APPEARANCE)
+    exposure = decision_for(evidence.exposure, EXPOSURE)
     exposure_why = (
         "a gain per photo explains it" if exposure == "on" else "the photos are about equally bright"
     )
     if appearance == exposure == "on":
         exposure_why = "the appearance embedding includes it"
-    antialias = answer(evidence.sampling, SAMPLING)
+    antialias = decision_for(evidence.sampling, SAMPLING)
     dense = _dense_start(evidence)
     lines: tuple[Decision, ...] = (
         Decision(
@@ -321,7 +321,7 @@ def _dense_start(evidence: Evidence) -> Decision:
     photos = evidence.photos
     few, middle = photos <= FEW_PHOTOS, evidence.outward > OUTWARD
     measured = photos >= MIN_PHOTOS and not math.isnan(evidence.exposure)
-    decision: Answer = "unknown" if not measured else "on" if few or middle else "off"
+    decision: DecisionState = "unknown" if not measured else "on" if few or middle else "off"
     if middle and not few:
         return Decision(
             "dense", "spread of the places looked at, over that of the cameras", evidence.outward, OUTWARD,
@@ -363,7 +363,7 @@ def plan_effects(scene: Scene) -> EffectsPlan:
         return decide(scene.name, nothing)
     from ambiguous_wild.io.images import load_image_float
 
-    return decide(scene.name, measure(scene, (load_image_float(v.image_path) for v in scene.train)))
+    return decide(scene.name, measure_evidence(scene, (load_image_float(v.image_path) for v in scene.train)))
 
 
 def read_plan(path: Path) -> EffectsPlan:

@@ -13,7 +13,7 @@ import torch
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.harness.measures import ImageRow, measure_images, metrics
-from ambiguous_wild.harness.regions import true_distractor, true_shadow
+from ambiguous_wild.harness.regions import exact_distractor, exact_shadow
 from ambiguous_wild.harness.result_file import Cost, MaskScores
 from ambiguous_wild.io.files import atomic_dir
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
@@ -122,8 +122,8 @@ def kernel_threads() -> Iterator[int]:
         torch.set_num_threads(before)
 
 
-def drawn_by(trainer: Trainer, half: bool) -> Draw:
-    """Return how a trained model draws test views.
+def trained_renderer(trainer: Trainer, half: bool) -> Draw:
+    """Return the function that renders test views of a trained model.
 
     `half`: colour effects are fitted on the left half of the photo, columns 0 to ceil(W / 2); nothing else is
     changed.
@@ -208,8 +208,8 @@ def write_keeps(scene: Scene, keeps: Iterable[tuple[View, np.ndarray]], folder: 
             path = temporary / Path(view.name).with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
             write_png(path, keep.astype(np.uint8) * 255)
-            truth = true_distractor(scene, view)
-            shadow = true_shadow(scene, view)
+            truth = exact_distractor(scene, view)
+            shadow = exact_shadow(scene, view)
             if truth is not None:
                 scored = keep if shadow is None else keep | (shadow & ~truth)  # true negatives: in no score
                 counts.append(mask_metrics.confusion(scored, ~truth))

@@ -98,7 +98,7 @@ def _timed(program: Program, task: Task) -> tuple[Produced, Cost]:
         trained, spent = produced.cost.get("train_s"), time.perf_counter() - begin
         if trained is None or trained > spent:
             return produced, {}
-        meter.look(trained)
+        meter.calibrate(trained)
     finally:
         meter.end()
     return produced, {**meter.cost(trained), "cpu_s": own_s() - before}

@@ -22,19 +22,19 @@ from ambiguous_wild.harness.cell import (
 )
 from ambiguous_wild.harness.cell_run import (
     check_folder,
-    left_alone,
+    existing_outcome,
     refuse_other_code,
     run_cell,
 )
 from ambiguous_wild.harness.chosen_effects import (
-    Chosen,
-    check_wanted,
+    ChosenEffects,
+    parse_effects,
     published_effects,
     scene_protocol,
     takes_effects,
 )
 from ambiguous_wild.harness.effects_plan import EffectsPlan, plan_effects
-from ambiguous_wild.harness.start import start_file, start_line, started
+from ambiguous_wild.harness.start import start_file, start_line, with_start
 from ambiguous_wild.harness.timing import MAX_RATIO, MIN_RATIO, expected_s, slowness
 from ambiguous_wild.io.files import check_output
 from ambiguous_wild.io.scene_folder import ALL_TRAINED, load_scene
@@ -145,11 +145,11 @@ def plan_cells(
             "without --start"
         )
     for scene in loaded:
-        started(MethodHooks(), file, scene)
+        with_start(MethodHooks(), file, scene)
     cells = []
     for scene in loaded:
         identity = scene_identity(scene)
-        chosen = choose(effects, scene, list(named.values()), plan)
+        chosen = choose_effects(effects, scene, list(named.values()), plan)
         measured = protocol or scene_protocol(scene)
         for entry, options in resolved:
             for seed in dict.fromkeys(seeds):
@@ -241,14 +241,14 @@ def run_cells(
     """
     options, callbacks = options or RunOptions(output / ".cache"), callbacks or Callbacks()
     reports = []
-    for cell, folder in zip(cells, checked_folders(cells, output, options)):
+    for cell, folder in zip(cells, check_run_folders(cells, output, options)):
         callbacks.started(cell, folder)
         reports.append(run_cell(cell, folder, options, callbacks.tick))
         callbacks.ended(cell, reports[-1])
     return reports
 
 
-def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) -> list[Path]:
+def check_run_folders(cells: Sequence[Cell], output: Path, options: RunOptions) -> list[Path]:
     """Return the run folder of every cell, after a check of all of them.
 
     Raises:
@@ -270,7 +270,7 @@ def checked_folders(cells: Sequence[Cell], output: Path, options: RunOptions) ->
     return folders
 
 
-def grouped(planned: Mapping[str, Sequence[Cell]], budgets_s: Sequence[float] = ()) -> list[Cell]:
+def expand_budgets(planned: Mapping[str, Sequence[Cell]], budgets_s: Sequence[float] = ()) -> list[Cell]:
     """Combine every cell with every budget, shortest first, and name the group of each.
 
     Where there is a single budget or choice of effects, it gets no folder of its own.
@@ -292,12 +292,14 @@ def grouped(planned: Mapping[str, Sequence[Cell]], budgets_s: Sequence[float] = 
     return cells
 
 
-def unfinished(cells: Sequence[Cell], output: Path, overwrite: Overwrite) -> list[Cell]:
+def cells_to_run(cells: Sequence[Cell], output: Path, overwrite: Overwrite) -> list[Cell]:
     """Return the cells that will be run, without those that are kept or skipped."""
-    return [cell for cell in cells if left_alone(cell_folder(output, cell), overwrite, cell.config) is None]
+    return [
+        cell for cell in cells if existing_outcome(cell_folder(output, cell), overwrite, cell.config) is None
+    ]
 
 
-def expected_line(cells: Sequence[Cell]) -> str:
+def expected_time_line(cells: Sequence[Cell]) -> str:
     """Return a line with the expected time of runs of the default length on this machine's CPU.
 
     The kernels must be compiled.
@@ -322,12 +324,12 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
-def choose(
+def choose_effects(
     wanted: str,
     scene: Scene,
     methods: Sequence[MethodEntry],
     plan: EffectsPlan | None = None,
-) -> dict[str, Chosen]:
+) -> dict[str, ChosenEffects]:
     """Return the effects that every method trains with on this scene, by the method's name.
 
     Args:
@@ -339,7 +341,7 @@ def choose(
     Raises:
         AwError: an effect is unknown, or the plan is of another scene.
     """
-    named = check_wanted(wanted)
+    named = parse_effects(wanted)
     if plan is not None and plan.scene != scene.name:
         raise AwError(f"the plan is of scene {plan.scene}, not of {scene.name}: run 'aw plan {scene.root}'")
     if plan is not None and plan.scene_hash and plan.scene_hash != scene_identity(scene):
@@ -348,10 +350,10 @@ def choose(
             f"photos have changed): run 'aw plan {scene.root}'"
         )
     if wanted != "auto":
-        asked = Chosen(named, "" if wanted == "none" else wanted)
-        return {m.name: asked if takes_effects(m) else Chosen() for m in methods}
+        asked = ChosenEffects(named, "" if wanted == "none" else wanted)
+        return {m.name: asked if takes_effects(m) else ChosenEffects() for m in methods}
     if not any(map(takes_effects, methods)):
-        return {m.name: Chosen() for m in methods}
+        return {m.name: ChosenEffects() for m in methods}
     plan = plan_effects(scene) if plan is None else plan
-    auto = Chosen(check_effects([*plan.effects(), *published_effects(scene)]), "auto", plan)
-    return {m.name: auto if takes_effects(m) else Chosen() for m in methods}
+    auto = ChosenEffects(check_effects([*plan.effects(), *published_effects(scene)]), "auto", plan)
+    return {m.name: auto if takes_effects(m) else ChosenEffects() for m in methods}

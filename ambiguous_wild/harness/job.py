@@ -22,7 +22,7 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.harness.cell import Cell, CellReport, RunOptions, code_hash, scene_identity
 from ambiguous_wild.harness.cell_run import error_line, run_cell
-from ambiguous_wild.harness.chosen_effects import Chosen
+from ambiguous_wild.harness.chosen_effects import ChosenEffects
 from ambiguous_wild.harness.measures import load_metrics
 from ambiguous_wild.harness.result_file import FAILED, RESULT, RunConfig, write_result
 from ambiguous_wild.harness.start import recorded_start
@@ -31,7 +31,13 @@ from ambiguous_wild.io.files import folder_lock, patient_lock
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.entry import trained_once
 from ambiguous_wild.methods.graft import graft_pairs, split_graft
-from ambiguous_wild.methods.references import EXTERNAL, MASKS, NERFBASELINES, reference_file, with_file
+from ambiguous_wild.methods.references import (
+    EXTERNAL,
+    MASKS,
+    NERFBASELINES,
+    reference_file,
+    replace_reference_file,
+)
 from ambiguous_wild.methods.registry import get_method, load_plugin, load_reference
 from ambiguous_wild.splat.train_config import TrainConfig
 
@@ -54,7 +60,7 @@ class Job:
     """The values to make a cell again and run it."""
 
     config: RunConfig
-    chosen: Chosen
+    chosen: ChosenEffects
     identity: str
     scene: str  # absolute path
     folder: str  # absolute path of the run folder
@@ -116,7 +122,7 @@ def run_job(job: Job) -> CellReport:
         if cell.method.program is None and cell.device == "cpu":
             prepare_cpu(job.threads)
         elif cell.method.program is None:
-            readiness.require(readiness.look())
+            readiness.require_gpu(readiness.gpu_facts())
         with patient_lock(folder, "aw bench", LOCK_WAIT_S):
             pass
     except Exception as error:
@@ -198,7 +204,10 @@ def _load(source: CodeSource) -> None:
     elif source.kind == "metric":
         load_metrics(path)
     else:
-        load_reference(with_file(source.text, path), given_as=with_file(source.text, Path(source.path)))
+        load_reference(
+            replace_reference_file(source.text, path),
+            given_as=replace_reference_file(source.text, Path(source.path)),
+        )
 
 
 @functools.cache

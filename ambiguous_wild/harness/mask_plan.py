@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from ambiguous_wild.core import Scene, SparsePoints
 from ambiguous_wild.harness.cell import scene_identity
-from ambiguous_wild.harness.effects_plan import Decision, EffectsPlan, answer, plan_effects
+from ambiguous_wild.harness.effects_plan import Decision, EffectsPlan, decision_for, plan_effects
 from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat.calibration import prepare_cpu
@@ -42,9 +42,9 @@ from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import train
 
-LONGEST = 160  # px, longer side of the probe's photos
+MAX_SIDE = 160  # px, longer side of the probe's photos
 ITERATIONS = 300
-SETTLED = 1200  # iterations after which fine texture is learnt, but a distractor in one photo is not
+LONG_ITERATIONS = 1200  # iterations after which fine texture is learnt, but a distractor in one photo is not
 WINDOW = 1 / 20  # side of the window, of the photo's longer side
 STANDS_OUT = 0.12  # of the colour range: mean residual of a window in the worst channel
 TIMED_ROUNDS, TIMED_STEPS = 12, 3  # to time an effect, after a first round
@@ -60,8 +60,8 @@ MIN_DB = 0.02
 # Share of unexplained pixels: static captures have 0.0 to 0.9 %, captures with distractors 0.6 % or more.
 CERTAIN = 0.03
 MASK_LINES = ("masks", "masks, local", "masks, global", "entropy density")
-STATIC = "static: leaving out the patches does not improve held-back pixels"
-HELD_BACK = 0.2  # share of a photo's blocks that is left out
+STATIC = "static: leaving out the patches does not improve held-out pixels"
+HELD_OUT_SHARE = 0.2  # share of a photo's blocks that is left out
 BLOCKS = 8  # number along a photo's longest side
 MEASURED_FROM = 0.5  # share of a probe after which visits measure
 FIXED = DensityConfig(start=1e9, stop=0.0)
@@ -84,7 +84,7 @@ def small_data(scene: Scene, folder: Path) -> TrainData:
     data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
     photos, cameras, keeps = [], [], []
     for photo, camera, keep in zip(data.photos, data.cameras, data.user_keep):
-        scale = min(1.0, LONGEST / max(photo.shape[:2]))
+        scale = min(1.0, MAX_SIDE / max(photo.shape[:2]))
         size = (max(round(photo.shape[0] * scale), 8), max(round(photo.shape[1] * scale), 8))
         chw = torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], size=size, mode="area")
         photos.append(chw[0].permute(1, 2, 0).contiguous())
@@ -196,7 +196,7 @@ def measure_occlusion(
     *,
     bar: Callable[..., AbstractContextManager[Any]],
 ) -> Occlusion:
-    """Train a probe of `ITERATIONS`; where its residual mask is large, one of `SETTLED` iterations counts.
+    """Train a probe of `ITERATIONS`; where its residual mask is large, one of `LONG_ITERATIONS` counts.
 
     Fine texture is learnt late, a distractor in one photo never. Example: drone photos of fields have 1.5 %
     after 300 iterations and 0.2 % after 1200, a thin distractor in a courtyard 1.5 and 1.4 %.
@@ -206,7 +206,7 @@ def measure_occlusion(
         effects: see `occlusion`.
         bar: called with total=iterations, returns a context whose `update` counts one, such as tqdm.
     """
-    for iterations in (ITERATIONS, SETTLED):
+    for iterations in (ITERATIONS, LONG_ITERATIONS):
         with bar(total=iterations) as progress:
             result = occlusion(scene, effects, iterations=iterations, tick=progress.update)
         if result.share <= OCCLUSION:
@@ -214,7 +214,7 @@ def measure_occlusion(
     return result
 
 
-class HeldBack(MaskPolicy):
+class HeldOutBlocks(MaskPolicy):
     """Leave blocks of every photo out of the loss and measure the render there."""
 
     def __init__(
@@ -242,20 +242,20 @@ class HeldBack(MaskPolicy):
         return self.keeps[step.view]
 
 
-def held_back(data: TrainData, seed: int) -> list[Tensor]:
+def held_out_blocks(data: TrainData, seed: int) -> list[Tensor]:
     """Choose blocks of every photo at random, [H, W] bool; never where the capture's own mask lies."""
     maps = []
     for view, (photo, keep) in enumerate(zip(data.photos, data.user_keep)):
         height, width = photo.shape[:2]
         side = max(max(height, width) // BLOCKS, 1)
         drawn = np.random.default_rng([seed, 0x68, view]).random((-(-height // side), -(-width // side)))
-        chosen = drawn <= np.quantile(drawn, HELD_BACK)
+        chosen = drawn <= np.quantile(drawn, HELD_OUT_SHARE)
         blocks = torch.from_numpy(np.kron(chosen, np.ones((side, side), bool))[:height, :width])
         maps.append(blocks if keep is None else blocks & (keep > 0.5))
     return maps
 
 
-def sampled(scene: Scene) -> tuple[Scene, list[int]]:
+def sample_photos(scene: Scene) -> tuple[Scene, list[int]]:
     """Return the scene with at most `MAX_PHOTOS` train photos, and their indices in `scene.train`."""
     train = [index for index, view in enumerate(scene.views) if view.split == "train"]
     if len(train) <= MAX_PHOTOS:
@@ -270,7 +270,7 @@ def sampled(scene: Scene) -> tuple[Scene, list[int]]:
 
 
 def without_blocks(scene: Scene, blocks: Sequence[Tensor]) -> SparsePoints:
-    """Return the points without observations in held-back pixels, from whose colours effects would start."""
+    """Return the points without observations in held-out pixels, which would leak to effects."""
     points, views = scene.points, scene.points.track_views.copy()
     train = [index for index, view in enumerate(scene.views) if view.split == "train"]
     for index, block in zip(train, blocks):
@@ -283,8 +283,8 @@ def without_blocks(scene: Scene, blocks: Sequence[Tensor]) -> SparsePoints:
     return dataclasses.replace(points, track_views=views)
 
 
-class Pair:
-    """The photos and blocks of one scene, on which the two trainings are compared."""
+class MaskComparison:
+    """Compares trainings with and without masks on held-out blocks of one scene."""
 
     def __init__(self, scene: Scene, folder: Path) -> None:
         """
@@ -292,13 +292,13 @@ class Pair:
             scene: the scene.
             folder: folder for temporary files.
         """
-        scene, self.chosen = sampled(scene)
+        scene, self.chosen = sample_photos(scene)
         data = small_data(scene, folder)
         self.folder = folder
-        self.blocks = held_back(data, SEED)
+        self.blocks = held_out_blocks(data, SEED)
         hidden = dataclasses.replace(scene, points=without_blocks(scene, self.blocks))
         self.data = dataclasses.replace(data, scene=hidden)
-        # Colours of held-back pixels do not say which points the start leaves out.
+        # Colours of held-out pixels do not say which points the start leaves out.
         keeps = [
             ~block if keep is None else (keep > 0.5) & ~block
             for block, keep in zip(self.blocks, data.user_keep)
@@ -317,13 +317,13 @@ class Pair:
 
         Args:
             effects: the colour effects of the plan.
-            patches, masked: see `HeldBack`.
+            patches, masked: see `HeldOutBlocks`.
             tick: called after every iteration.
             iterations: length of the training.
         """
-        policy = HeldBack(self.blocks, patches, masked)
+        policy = HeldOutBlocks(self.blocks, patches, masked)
         # "images" sets both pictures to zero in the blocks, so that no window of SSIM uses them
-        hooks = MethodHooks(given=self.first, mask=policy, density_config=FIXED, weighting="images")
+        hooks = MethodHooks(user_start=self.first, mask=policy, density_config=FIXED, weighting="images")
         config = TrainConfig(iterations=iterations, seed=SEED, probes=0, checkpoint_every_s=1e9)
         trainer = Trainer(self.data, with_effects(hooks, effects), config, folder=self.folder)
         train(trainer, tick=lambda _: tick())
@@ -335,19 +335,19 @@ Bar = Callable[..., AbstractContextManager[Any]]
 
 
 @dataclass(frozen=True)
-class Gain:
-    """The gain of leaving patches out, on the held-back pixels of the same photos."""
+class MaskingGain:
+    """PSNR that masking the patches gains on held-out pixels of the same photos."""
 
     db: float  # mean over photos
     error_db: float  # standard error of that mean
 
 
-def compare(with_it: Mapping[str, float], without: Mapping[str, float]) -> Gain | None:
-    """Return the gain photo by photo; None if the two share too few photos."""
+def masking_gain(with_it: Mapping[str, float], without: Mapping[str, float]) -> MaskingGain | None:
+    """Return the mean gain over photos; None if the trainings share too few photos."""
     difference = np.array([with_it[name] - without[name] for name in without if name in with_it])
     if len(difference) < MIN_PHOTOS:
         return None
-    return Gain(float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(len(difference))))
+    return MaskingGain(float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(len(difference))))
 
 
 def plan(scene: Path | str) -> EffectsPlan:
@@ -374,16 +374,16 @@ def with_masks(plan: EffectsPlan, scene: Scene, bar: Bar = NO_BAR) -> EffectsPla
     if occlusion.share < OCCLUSION:
         return plan
     with tempfile.TemporaryDirectory(prefix="aw-plan-") as folder:
-        pair = Pair(scene, Path(folder))
-        patches = [torch.from_numpy(occlusion.patches[place]) for place in pair.chosen]
+        comparison = MaskComparison(scene, Path(folder))
+        patches = [torch.from_numpy(occlusion.patches[place]) for place in comparison.chosen]
         psnr = []
         for masked in (True, False):
             with bar(total=ITERATIONS) as progress:
-                psnr.append(pair.train(colour, patches, masked, progress.update))
-    return with_gain(plan, compare(*psnr))
+                psnr.append(comparison.train(colour, patches, masked, progress.update))
+    return with_gain(plan, masking_gain(*psnr))
 
 
-def with_gain(plan: EffectsPlan, gain: Gain | None) -> EffectsPlan:
+def with_gain(plan: EffectsPlan, gain: MaskingGain | None) -> EffectsPlan:
     """Return the plan with masks off if few pixels are unexplained and leaving them out does not help.
 
     From `CERTAIN` on masks stay on: a sparse model of few points is too coarse to show the difference.
@@ -413,7 +413,7 @@ def with_occlusion(plan: EffectsPlan, occlusion: Occlusion) -> EffectsPlan:
     def line(
         effect: str, evidence: str, value: float, threshold: float, on: str, off: str, how: str
     ) -> Decision:
-        decision = answer(value, threshold)
+        decision = decision_for(value, threshold)
         why = on if decision == "on" else off
         return Decision(effect, evidence, value, threshold, "of the pixels", decision, why, how)
 

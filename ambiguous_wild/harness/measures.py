@@ -1,4 +1,4 @@
-"""What can be measured of a run, as data: metrics of test images (built in or a user's), masks and cost.
+"""Columns of results: metrics of test images (built in or a user's), masks and cost.
 
 A user's metric is a `Metric` in a file (`--metric-file my_metric.py`) or in a package (entry points
 `ambiguous_wild.metrics`). Each result keeps a record of it, so that tables need neither file nor package.
@@ -221,7 +221,7 @@ def users_metrics() -> dict[str, Metric]:
     return {key: m for key, m in metrics().items() if key not in MEASURES}
 
 
-def try_own(scene: Scene) -> None:
+def check_user_metrics(scene: Scene) -> None:
     """Raise AwError if a user's metric fails on a test photo against itself; called before training."""
     for view in scene.test[:1] if (mine := users_metrics()) else ():
         photo = read_png_rgb(view.image_path)
@@ -295,14 +295,14 @@ def measure_images(
             raise AwError(f"the render of {name} differs from its photo in size: render at the photo's size")
         left = pair[1].shape[1] // 2 if half else 0
         render, photo = (np.ascontiguousarray(picture[:, left:]) for picture in pair)
-        asked = [metric for metric in metrics if metric.key not in missing]
+        wanted = [metric for metric in metrics if metric.key not in missing]
         value = partial(_value_or_error, render=render, photo=photo, view=views[name], scene=scene)
         with around() as threads:
-            values = list(in_order(value, asked, min(threads, photo_threads(photo.size, BYTES_A_CODE))))
+            values = list(in_order(value, wanted, min(threads, photo_threads(photo.size, BYTES_A_CODE))))
         rows.append({"name": name})
-        for metric, found in zip(asked, values):
-            if isinstance(found, AwError):
-                missing[metric.key] = str(found)
-            elif not (metric.partial and math.isnan(found)):
-                rows[-1][metric.key] = found
+        for metric, result in zip(wanted, values):
+            if isinstance(result, AwError):
+                missing[metric.key] = str(result)
+            elif not (metric.partial and math.isnan(result)):
+                rows[-1][metric.key] = result
     return [cast(ImageRow, {k: v for k, v in row.items() if k not in missing}) for row in rows], missing

@@ -25,7 +25,7 @@ from ambiguous_wild.core.config import State
 from ambiguous_wild.core.machine import allowed_cores
 from ambiguous_wild.harness.result_file import Cost, TimeRecord
 from ambiguous_wild.harness.timing import Verdict, in_reference_seconds
-from ambiguous_wild.splat.calibration import KERNELS, Reading, calibration
+from ambiguous_wild.splat.calibration import KERNELS, CalibrationResult, calibration
 
 _STAT = Path("/proc/stat")
 _IDLE = (3, 4)  # fields of a line of /proc/stat: idle, waiting for a disk
@@ -66,7 +66,7 @@ def own_s() -> float:
     return time.process_time() + times.children_user + times.children_system
 
 
-def unit(device: str) -> str:
+def hardware_name(device: str) -> str:
     """Return a name for the hardware that runs on this device share: the processors, or a GPU's identity."""
     return _gpu_name(device) if device.startswith("cuda") else "cpu"
 
@@ -77,7 +77,7 @@ class ActiveRuns:
     def __init__(self, unit: str, folder: Path | None = None) -> None:
         """
         Args:
-            unit: name of the shared hardware, see `unit`.
+            unit: name of the shared hardware, see `hardware_name`.
             folder: where every run has a locked file; None = a folder of this user on this machine.
         """
         safe = "".join(c if c.isalnum() or c == "-" else "-" for c in unit)
@@ -151,7 +151,7 @@ class Meter:
         device: str,
         threads: int,
         *,
-        read: Callable[[], Reading] | None = None,
+        read: Callable[[], CalibrationResult] | None = None,
         presence: ActiveRuns | None = None,
     ) -> None:
         """
@@ -164,7 +164,7 @@ class Meter:
         self.device, self.threads = device, threads
         self.kernel = KERNELS["cuda" if device.startswith("cuda") else "cpu"]
         self._read = read or (lambda: calibration(torch.device(device)).read())
-        self.presence = presence or ActiveRuns(unit(device))
+        self.presence = presence or ActiveRuns(hardware_name(device))
         self._stack = ExitStack()
         self.samples: list[list[float]] = []  # trained seconds and the numbers of a Reading; NaN = missing
         self.runs = 1
@@ -195,7 +195,7 @@ class Meter:
             return ago > 0.0
         return ago >= min(max(MIN_S, SHARE * trained_s), EVERY_S)
 
-    def look(self, trained_s: float) -> None:
+    def calibrate(self, trained_s: float) -> None:
         """Calibrate, and add the work of others since the last calibration."""
         self._close()
         self._sample(trained_s)

@@ -32,7 +32,7 @@ ROWS = ".moments"  # folder of finished rows while the run trains; hidden, becau
 SHOWN = 20_000  # most points of a kind in a picture
 
 
-class Recorder:
+class TrainingPictures:
     """Draw a row of pictures of each chosen view whenever the run passes a moment.
 
     It is called after every iteration, with the clock stopped. Rows are kept on disk, too, until the end, so
@@ -57,7 +57,7 @@ class Recorder:
         if self.passed in (0, before):  # a rollback may lead to before the first moment
             return
         for view, rows in self.rows.items():
-            row = rows[self.passed] = strip(trainer, view)
+            row = rows[self.passed] = picture_row(trainer, view)
             write_png(self._row(trainer, view, self.passed), row, compressed=False)
         self._join(trainer, compressed=False)
 
@@ -86,7 +86,7 @@ def file_stem(trainer: Trainer, view: int) -> str:
     return str(PurePosixPath(trainer.data.scene.train[view].name).with_suffix("")).replace("/", "_")
 
 
-def strip(trainer: Trainer, view: int) -> np.ndarray:
+def picture_row(trainer: Trainer, view: int) -> np.ndarray:
     """Draw photo, render, error and the method's panels of a train view as one row, [h, w, 3] uint8."""
     spent = dict(trainer.clock.parts_s)
     step = trainer.make_step(max(trainer.iteration, 1), view, downsampling=1)
@@ -103,7 +103,7 @@ def strip(trainer: Trainer, view: int) -> np.ndarray:
     return sheets.stack([sheets.cell(name, image, CELL) for name, image in (cells | panels).items()], 1)
 
 
-def draw_all(trainer: Trainer, recorder: Recorder, folder: Path) -> list[Path]:
+def draw_all(trainer: Trainer, recorder: TrainingPictures, folder: Path) -> list[Path]:
     """Draw every picture of a finished run; return the paths written.
 
     Args:
@@ -139,7 +139,9 @@ def draw_density(trainer: Trainer, path: Path) -> list[Path]:
 def _counts(axes: Any, trainer: Trainer) -> None:
     rounds, rows = trainer.density.log.rounds, trainer.timeline.rows
     steps = np.array([0] + [r["iteration"] for r in rows] + [r.iteration for r in rounds])
-    count = np.array([trainer.pace.start] + [r["gaussians"] for r in rows] + [r.count for r in rounds])
+    count = np.array(
+        [trainer.run_schedule.start] + [r["gaussians"] for r in rows] + [r.count for r in rounds]
+    )
     order = np.argsort(steps, kind="stable")
     axes.plot(steps[order], count[order], color="k", lw=1.5)
     merges = [r for r in rounds if r.merged]

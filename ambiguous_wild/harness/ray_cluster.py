@@ -20,7 +20,7 @@ from typing import Any
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.callbacks import Engine
 from ambiguous_wild.harness.cell import CellReport, RunOptions
-from ambiguous_wild.harness.cell_run import OURS, TRACEBACK, error_line, is_finished, left_alone
+from ambiguous_wild.harness.cell_run import OURS, TRACEBACK, error_line, existing_outcome, is_finished
 from ambiguous_wild.harness.job import LOCK_WAIT_S, Job, run_job
 from ambiguous_wild.harness.result_file import FAILED, RESULT, read_result
 from ambiguous_wild.io.archive import Limits, pack_folder, unpack
@@ -132,7 +132,7 @@ class RayCluster:
                 token.touch()
             for index, job in enumerate(jobs):
                 folder = Path(job.folder)
-                if (outcome := left_alone(folder, job.options.overwrite, job.config)) is not None:
+                if (outcome := existing_outcome(folder, job.options.overwrite, job.config)) is not None:
                     ended(index, CellReport(folder, outcome))
                 elif store:
                     if job.scene not in scenes:
@@ -174,7 +174,11 @@ class RayCluster:
         errors = self.ray.exceptions
         try:
             value = self.ray.get(reference)
-            return receive(value, job, self.engine.transfer_limit) if isinstance(value, Sent) else value
+            return (
+                unpack_report(value, job, self.engine.transfer_limit)
+                if isinstance(value, PackedReport)
+                else value
+            )
         except errors.RayTaskError as error:
             # the task could not begin on its node; errors of the cell itself are reports
             cause = error.cause if isinstance(error.cause, Exception) else error
@@ -187,7 +191,7 @@ class RayCluster:
 
 
 @dataclass(frozen=True)
-class Sent:
+class PackedReport:
     """A report with its packed run folder, which is empty where there is none."""
 
     report: CellReport
@@ -204,7 +208,7 @@ def send_scene(scene: Path, limit_mb: float) -> tuple[str, bytes]:
     return hashlib.sha256(content).hexdigest(), content
 
 
-def run_sent(job: Job, scene_key: str, scene: bytes, limit_mb: float) -> Sent:
+def run_sent(job: Job, scene_key: str, scene: bytes, limit_mb: float) -> PackedReport:
     """On a node: unpack the scene unless it is cached, run the job in a local folder, and pack that."""
     user = os.getuid() if hasattr(os, "getuid") else "user"
     cache = Path(tempfile.gettempdir()) / f"ambiguous_wild-{user}"
@@ -221,10 +225,10 @@ def run_sent(job: Job, scene_key: str, scene: bytes, limit_mb: float) -> Sent:
         folder, options = Path(own) / "seed", RunOptions(cache / "features", pictures=job.options.pictures)
         report = run_job(replace(job, scene=str(place), folder=str(folder), options=options))
         content = pack_folder(folder, limit_mb) if folder.is_dir() else b""
-    return Sent(replace(report, folder=Path(job.folder)), content)
+    return PackedReport(replace(report, folder=Path(job.folder)), content)
 
 
-def receive(sent: Sent, job: Job, limit_mb: float) -> CellReport:
+def unpack_report(sent: PackedReport, job: Job, limit_mb: float) -> CellReport:
     """On the machine that sent the job: unpack the run folder, whole or not at all.
 
     A run that failed replaces nothing: an earlier run here, or its checkpoint, is worth more.

@@ -32,7 +32,7 @@ from ambiguous_wild.vision.sparse_surface import (
     in_map,
     inside,
     inverse_depth,
-    some_points,
+    subsample_points,
     world_points,
 )
 
@@ -63,7 +63,7 @@ def train_visibility(scene: Scene, masks: Sequence[np.ndarray | None]) -> dict[s
     """
     exact = any(mask is not None for mask in masks)
     used = [(view, mask) for view, mask in zip(scene.train, masks) if mask is not None or not exact]
-    xyz = some_points(scene.points.sure_xyz)
+    xyz = subsample_points(scene.points.sure_xyz)
     cameras = [view.camera for view, _ in used]
     depths = [inverse_depth(camera, xyz) for camera in cameras]
     visibility = {}
@@ -97,7 +97,7 @@ def photo_consistency(scene: Scene) -> dict[str, np.ndarray] | str:
         By the name of the test view: [H, W] bool, False where fewer than three train photos show the surface;
         or why no pixel can be compared.
     """
-    xyz = some_points(scene.points.sure_xyz)
+    xyz = subsample_points(scene.points.sure_xyz)
     cameras = [view.camera for view in scene.train]
     depths = [inverse_depth(camera, xyz) for camera in cameras]
     photos = {k: _small(scene.train[k], depth.shape) for k, depth in enumerate(depths) if depth is not None}
@@ -249,7 +249,7 @@ def _find_regions(scene: Scene) -> Regions:
         pixels[CONSISTENT] = consistent
     else:
         missing[CONSISTENT] = "no pixel of a test photo looks as train photos show its surface"
-    masks_of_train = [true_distractor(scene, view) for view in scene.train]
+    masks_of_train = [exact_distractor(scene, view) for view in scene.train]
     visibility = train_visibility(scene, masks_of_train)
     if isinstance(visibility, str):
         return Regions(pixels, missing | dict.fromkeys((COVERED, UNCOVERED, SUPPORTED), visibility))
@@ -268,12 +268,12 @@ def _find_regions(scene: Scene) -> Regions:
     return Regions(pixels, missing)
 
 
-def true_distractor(scene: Scene, view: View) -> np.ndarray | None:
+def exact_distractor(scene: Scene, view: View) -> np.ndarray | None:
     """Return the exact mask of a photo, [H, W] bool, True on distractors; None if the capture has none."""
     return _exact(scene, view, "distractor")
 
 
-def true_shadow(scene: Scene, view: View) -> np.ndarray | None:
+def exact_shadow(scene: Scene, view: View) -> np.ndarray | None:
     """Return where distractors change a photo without being there, [H, W] bool; None if nowhere."""
     return _exact(scene, view, "shadow")
 

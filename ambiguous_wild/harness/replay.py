@@ -1,4 +1,4 @@
-"""Bring the trainer of a run back: after its last step, or where a value was not finite."""
+"""Restore the trainer of a run: after its last step, or where a value was not finite."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import from_plain
-from ambiguous_wild.harness.start import recorded_start, started
+from ambiguous_wild.harness.start import recorded_start, with_start
 from ambiguous_wild.harness.trained_models import open_scene
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.corrections import CORRECTIONS, CorrectionsFile
@@ -31,15 +31,15 @@ class Replay:
     """The finding that the run reported, and the one of the replay."""
 
     reported: str
-    found: str  # "" = the replay met no such value
+    reproduced: str  # "" = the replay met no such value
     started_at: int  # iteration
 
     @property
-    def same(self) -> bool:
-        return self.reported == self.found
+    def matches(self) -> bool:
+        return self.reported == self.reproduced
 
 
-def replay(run: Path) -> Replay:
+def replay_run(run: Path) -> Replay:
     """Train a copy of the run from its last good state to where it failed; the run itself stays as it is.
 
     Args:
@@ -121,7 +121,7 @@ def _trainer(run: Path, config: dict[Any, Any], folder: Path, saved: Path) -> Tr
         cache_dir=folder / "cache",
         corrections=None if corrections is None else corrections.masks(scene),
     )
-    hooks = started(hooks, recorded_start(config.get("start")), scene)
+    hooks = with_start(hooks, recorded_start(config.get("start")), scene)
     trainer = Trainer(data, hooks, settings, folder=folder)
     if saved.is_file():
         trainer.checkpoint_path.parent.mkdir(parents=True)

@@ -109,7 +109,7 @@ def cost_of(cell: Cell, trainer: Trainer) -> Cost:
     return cost
 
 
-def both_passes(first: Cost, second: Cost) -> Cost:
+def two_pass_cost(first: Cost, second: Cost) -> Cost:
     """Return the cost of two trainings that make one result: sums, means over iterations, higher peaks."""
     one, other = (cast("dict[str, float]", dict(cost)) for cost in (first, second))
     total = {name: one[name] + other[name] for name in _SUMS if name in one and name in other}

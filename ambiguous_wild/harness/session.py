@@ -60,9 +60,9 @@ class Session:
             return device
         if device == "cpu":
             return device
-        from ambiguous_wild.splat.readiness import choose
+        from ambiguous_wild.splat.readiness import choose_device
 
-        return choose(device, self.callbacks.say)
+        return choose_device(device, self.callbacks.say)
 
     def in_process(self, cells: Sequence[Cell]) -> bool:
         """Return whether cells run in this process one by one; otherwise `run` starts other processes.
@@ -87,7 +87,7 @@ class Session:
         sources: tuple[CodeSource, ...] = (),  # code that the runs need
     ) -> list[CellReport]:
         """Run the cells in processes of this machine or on the cluster; return reports in their order."""
-        from ambiguous_wild.harness.grid import checked_folders
+        from ambiguous_wild.harness.grid import check_run_folders
         from ambiguous_wild.harness.job import make_job, record_lost
 
         engine, say = self.engine, self.callbacks.say
@@ -97,7 +97,7 @@ class Session:
             if cluster
             else max(1, usable_cores() // (engine.jobs or 1))
         )
-        folders = checked_folders(cells, output, options)
+        folders = check_run_folders(cells, output, options)
         jobs = [make_job(cell, folder, options, sources, threads) for cell, folder in zip(cells, folders)]
 
         def lost(index: int, reason: str) -> CellReport:

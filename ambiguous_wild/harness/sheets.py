@@ -12,7 +12,7 @@ import numpy as np
 
 from ambiguous_wild.core import Scene, View
 from ambiguous_wild.core.names import ascii_text
-from ambiguous_wild.harness.regions import true_distractor
+from ambiguous_wild.harness.regions import exact_distractor
 from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.images import read_gray, read_png_rgb
 from ambiguous_wild.io.page_parts import jpeg_bytes
@@ -165,7 +165,7 @@ def _mask(folder: Path, view: View) -> Path:
 def _tinted(scene: Scene, view: View, masks: Path) -> np.ndarray:
     photo, masked = read_png_rgb(view.image_path), read_gray(_mask(masks, view)) < 128
     caption = f"{view.name}: {100 * masked.mean():.0f} % masked"
-    truth = true_distractor(scene, view)
+    truth = exact_distractor(scene, view)
     if truth is not None:
         caption += f", {100 * truth.mean():.0f} % true"
     return cell(caption, tint(photo, masked, MASKED), WIDTH)

@@ -56,8 +56,8 @@ def start_file(path: Path) -> StartFile:
     return StartFile(path.resolve(), sha256_file(path), count, "splats" if is_splats else "points")
 
 
-def started(hooks: MethodHooks, start: StartFile | None, scene: Scene) -> MethodHooks:
-    """Return the hooks of a method with the content of the file to start from.
+def with_start(hooks: MethodHooks, start: StartFile | None, scene: Scene) -> MethodHooks:
+    """Return the hooks of a method that starts from the file.
 
     Raises:
         AwError: the file has changed, or its content does not lie where the scene is.
@@ -72,20 +72,20 @@ def started(hooks: MethodHooks, start: StartFile | None, scene: Scene) -> Method
     if isinstance(content, SplatFile):
         arrays = moved(content.gaussians, content.transform, transform)
         _check_position(start.path, arrays["means"], scene)
-        return replace(hooks, given=gaussians_of(arrays))
+        return replace(hooks, user_start=gaussians_of(arrays))
     xyz = (content[0] - transform.centre) * transform.scale
     _check_position(start.path, xyz, scene)
-    return replace(hooks, given=(xyz, content[1]))
+    return replace(hooks, user_start=(xyz, content[1]))
 
 
 def start_line(start: StartFile, method: str, hooks: MethodHooks, train: TrainConfig, scene: Scene) -> str:
     """Return a line that says how many splats or points of the file a run starts from."""
-    from ambiguous_wild.splat.method_hooks import thinned
-    from ambiguous_wild.splat.pace import cap
+    from ambiguous_wild.splat.method_hooks import start_rows
+    from ambiguous_wild.splat.run_schedule import max_gaussians
 
     sizes = [(view.camera.height, view.camera.width) for view in scene.train]
-    most = cap(train, hooks.schedule, sizes, hooks.density_config.max_gaussians)
-    kept = len(thinned(start.count, most))
+    most = max_gaussians(train, hooks.schedule, sizes, hooks.density_config.max_gaussians)
+    kept = len(start_rows(start.count, most))
     thin = (
         f", chosen at random: it may have {most:,} Gaussians (--max-gaussians)" if kept < start.count else ""
     )
@@ -107,7 +107,7 @@ def _check_position(path: Path, xyz: np.ndarray, scene: Scene) -> None:
     """Refuse points [N, 3] that lie far from the scene's points; warn if few of them lie near."""
     from scipy.spatial import cKDTree
 
-    from ambiguous_wild.vision.sparse_surface import some_points
+    from ambiguous_wild.vision.sparse_surface import subsample_points
 
     points = scene.points.xyz
     if len(points) < _FEW_POINTS:
@@ -115,15 +115,15 @@ def _check_position(path: Path, xyz: np.ndarray, scene: Scene) -> None:
     cameras = cKDTree([view.camera.center for view in scene.train])
     shares = [
         float((cKDTree(others).query(some)[0] < _NEAR * cameras.query(some)[0]).mean())
-        for some, others in ((some_points(xyz), points), (some_points(points), xyz))
+        for some, others in ((subsample_points(xyz), points), (subsample_points(points), xyz))
     ]  # the greater counts: each of the two may cover a part of the scene alone
     if max(shares) < _FEW_NEAR:
         middle = np.median(xyz, axis=0) / scene.transform.scale + scene.transform.centre
         coordinates = ", ".join(f"{c:.4g}" for c in middle)
-        found = (
+        message = (
             f"{path} lies around ({coordinates}), and at most {max(shares):.0%} of its points and those of "
             f"{scene.name} lie near each other"
         )
         if max(shares) < _MIN_NEAR:
-            raise AwError(f"{found}: give a file of this scene, in its coordinates")
-        warnings.warn(plain(f"{found}: is it of another scene?"), stacklevel=2)
+            raise AwError(f"{message}: give a file of this scene, in its coordinates")
+        warnings.warn(plain(f"{message}: is it of another scene?"), stacklevel=2)

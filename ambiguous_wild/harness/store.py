@@ -178,7 +178,7 @@ def checked_result(run: Path) -> RunResult:
 
 def contradictions(config: ReadConfig, result: RunResult) -> Iterator[str]:
     """Yield in what a result differs from the settings of its run, of those that config.yaml holds."""
-    train, scene = section(config, "train"), section(config, "scene")
+    train, scene = config_section(config, "train"), config_section(config, "scene")
     facts = result["facts"]
     pairs = {
         "method": (config.get("method"), result["method"]),
@@ -189,13 +189,13 @@ def contradictions(config: ReadConfig, result: RunResult) -> Iterator[str]:
         "version": (config.get("version"), result["version"]),
         "protocol": (config.get("protocol"), facts.get("protocol", "full")),
         "hash of the settings": (config.get("config_hash"), result["config_hash"]),
-        "start": (str(section(config, "start").get("sha256", ""))[:8] or None, start_hash(facts)),
+        "start": (str(config_section(config, "start").get("sha256", ""))[:8] or None, start_hash(facts)),
     }
     if config.get("effects") and result["status"] == "ok":  # a failure states none
         pairs["effects"] = config["effects"], facts.get("effects")
-    for what, (asked, got) in pairs.items():
-        if asked is not None and asked != got:
-            yield f"{what} is {str(asked)[:40]!a} in {CONFIG} and {str(got)[:40]!a} in {RESULT}"
+    for what, (configured, recorded) in pairs.items():
+        if configured is not None and configured != recorded:
+            yield f"{what} is {str(configured)[:40]!a} in {CONFIG} and {str(recorded)[:40]!a} in {RESULT}"
 
 
 def start_hash(facts: RunFacts) -> str:
@@ -205,14 +205,14 @@ def start_hash(facts: RunFacts) -> str:
 
 def cost_contradictions(run: Path, result: RunResult, config: ReadConfig) -> Iterator[str]:
     """Yield in what costs differ from the model and the settings of the run; times are believed."""
-    cost, train = result["cost"], section(config, "train")
+    cost, train = result["cost"], config_section(config, "train")
     if result["status"] != "ok" or config.get("source"):  # a program of its own may write other files
         return
     if "gaussians" in cost and (run / MODEL).is_file() and cost["gaussians"] != splat_count(run / MODEL):
         yield f"{RESULT} has {cost['gaussians']} Gaussians, {MODEL} {splat_count(run / MODEL)}"
-    steps, asked = cost.get("iterations"), train.get("iterations")
-    if steps is not None and isinstance(asked, int) and not train.get("budget_s") and steps < asked:
-        yield f"{RESULT} has {steps} iterations, {CONFIG} asks for {asked}"
+    steps, configured = cost.get("iterations"), train.get("iterations")
+    if steps is not None and isinstance(configured, int) and not train.get("budget_s") and steps < configured:
+        yield f"{RESULT} has {steps} iterations, {CONFIG} asks for {configured}"
 
 
 def impossible_values(result: RunResult) -> Iterator[tuple[str, float, str]]:
@@ -298,7 +298,7 @@ def read_config(run: Path) -> ReadConfig:
         return {}
 
 
-def section(config: ReadConfig, name: str) -> ReadConfig:
+def config_section(config: ReadConfig, name: str) -> ReadConfig:
     """Return a part of config.yaml; empty where it is absent or no mapping."""
     part = config.get(name)
     return part if isinstance(part, dict) else {}
@@ -307,7 +307,7 @@ def section(config: ReadConfig, name: str) -> ReadConfig:
 def _method_and_scene(run: Path) -> tuple[str, str]:
     """Return method and scene of a run without a result: from its settings, else from its path."""
     config, method_folder = read_config(run), run.absolute().parent
-    name = section(config, "scene").get("name")
+    name = config_section(config, "scene").get("name")
     return str(config.get("method") or method_folder.name), str(name or method_folder.parent.name)
 
 
@@ -403,14 +403,16 @@ def effects_of(facts: RunFacts) -> str:
 
 def _length(config: ReadConfig) -> str:
     """Return `length_text` of config.yaml, for results of earlier versions; empty if it is not there."""
-    settings = section(config, "train")
+    settings = config_section(config, "train")
     return length_text(settings.get("iterations"), settings.get("budget_s"))
 
 
 def _training(config: ReadConfig) -> str:
     """Return the other settings of training that config.yaml holds, as text."""
     own = (*BOOKKEEPING, "torch_threads")
-    settings = sorted((key, value) for key, value in section(config, "train").items() if key not in own)
+    settings = sorted(
+        (key, value) for key, value in config_section(config, "train").items() if key not in own
+    )
     if not settings:
         return "not recorded"
     return ", ".join(f"{key} {'auto' if value is None else value}" for key, value in settings)
@@ -454,17 +456,17 @@ def _frame(rows: Iterator[TableRow], columns: list[str]) -> pd.DataFrame:
     return pd.DataFrame(listed) if listed else pd.DataFrame(columns=columns)
 
 
-def could_be_measured(results: Iterable[RunResult]) -> list[str]:
+def computable_metrics(results: Iterable[RunResult]) -> list[str]:
     """Return the metrics that these results lack and that can be measured now, own metrics included."""
     from ambiguous_wild.metrics import lpips  # imports torch
 
     now = {name for name, reason in lpips.available().items() if reason is None}
     listed = list(results)
     lacking = {name for r in listed for name, why in r["missing"].items() if lpips.TOO_SMALL not in why}
-    return sorted(lacking & now | {name for r in listed for name in users_metrics() if lacks(r, name)})
+    return sorted(lacking & now | {name for r in listed for name in users_metrics() if lacks_metric(r, name)})
 
 
-def lacks(result: RunResult, metric: str) -> bool:
+def lacks_metric(result: RunResult, metric: str) -> bool:
     """Return whether the result lacks the metric, or has it from another version of the metric's file."""
     record, mine = result.get("metrics", {}).get(metric), users_metrics().get(metric)
     if mine is not None and record is not None and record["source"] != mine.source:

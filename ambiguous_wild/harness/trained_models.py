@@ -29,7 +29,7 @@ from ambiguous_wild.harness.result_file import (
     metrics_of,
     read_result,
 )
-from ambiguous_wild.harness.store import ReadConfig, read_config, run_folders, section
+from ambiguous_wild.harness.store import ReadConfig, config_section, read_config, run_folders
 from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.mask_reasons import FILE as REASONS
 from ambiguous_wild.io.ply import splat_count
@@ -88,7 +88,7 @@ def read_models(
     Raises:
         AwError: no run, no model in any, runs of several scenes, a wrong label, or a scene that was moved.
     """
-    files, notes = read_files(paths)
+    files, notes = read_splat_models(paths)
     folders = [path for path in paths if not path.is_file()]
     if files and not folders:
         shown_names(labels, ())  # files have no method
@@ -96,7 +96,7 @@ def read_models(
         if scene_folder is None:
             notes.append(f"no --scene: the cameras are on a circle around {files[0].ply.name}, y down")
         return SceneModels(opened, tuple(model.within(opened.transform) for model in files), tuple(notes))
-    trained, more = find_models(folders if files else paths, labels)
+    trained, more = find_run_models(folders if files else paths, labels)
     notes += more
     names = sorted({t.scene for t in trained})
     if len(names) > 1:
@@ -114,7 +114,7 @@ def read_models(
     return SceneModels(opened, models, tuple(notes), mixed_tests(opened), tuple(t.run for t in trained))
 
 
-def read_files(paths: Sequence[Path]) -> tuple[list[ViewedModel], list[str]]:
+def read_splat_models(paths: Sequence[Path]) -> tuple[list[ViewedModel], list[str]]:
     """Read the models of the splat files among the paths, with unique labels, and notes on them.
 
     Raises:
@@ -126,7 +126,9 @@ def read_files(paths: Sequence[Path]) -> tuple[list[ViewedModel], list[str]]:
     return models, [note for _, note in read if note]
 
 
-def find_models(paths: Sequence[Path], labels: Sequence[str] = ()) -> tuple[list[TrainedModel], list[str]]:
+def find_run_models(
+    paths: Sequence[Path], labels: Sequence[str] = ()
+) -> tuple[list[TrainedModel], list[str]]:
     """Find the finished runs that have a model, in the order of their paths; write a line on each other run.
 
     `labels` name and order the methods, see `labels.shown_names`. The models' labels distinguish runs of the
@@ -324,7 +326,7 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
         AwError: effects or background are damaged.
     """
     name, source = str(config.get("method", "")), str(config.get("source", ""))
-    options = section(config, "options")
+    options = config_section(config, "options")
     try:
         if is_reference(name):
             raise AwError(f"{name} is a file")
@@ -333,7 +335,7 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
         as_host = rest != "" and "effects=" not in rest and not get_method(host).source_hash
         entry = get_method(host if as_host else name)
         if as_host:
-            source, options = "", section(options, "host")
+            source, options = "", config_section(options, "host")
         if entry.program is not None:
             return RenderSettings(), ""
     except AwError:
@@ -347,7 +349,7 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
     except AwError as error:  # an option of another version
         hooks, note = entry.build(entry.options()), f"{name} is drawn with its present defaults: {error}"
     effects = config.get("effects") or ()
-    behind = section(config, "scene").get("background", hooks.background)
+    behind = config_section(config, "scene").get("background", hooks.background)
     try:
         antialias = hooks.antialias or "antialias" in effects
         red, green, blue = map(float, behind)

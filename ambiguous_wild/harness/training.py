@@ -26,13 +26,13 @@ from ambiguous_wild.harness.measures import ImageRow
 from ambiguous_wild.harness.meter import Meter
 from ambiguous_wild.harness.result_file import MODEL, STOPPED, Cost, RunFacts, RunResult
 from ambiguous_wild.harness.run_cost import (
-    both_passes,
     cost_of,
     is_out_of_gpu_memory,
     out_of_gpu_memory,
     reset_peak,
+    two_pass_cost,
 )
-from ambiguous_wild.harness.start import started
+from ambiguous_wild.harness.start import with_start
 from ambiguous_wild.io.files import atomic_dir, own_json, sha256_file, write_json
 from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.io.ply import write_splat_ply
@@ -65,7 +65,7 @@ def train_and_measure(cell: Cell, folder: Path, options: RunOptions, tick: Tick 
         AwError: the GPU has too little memory; the error says what helps.
     """
     trainer: Trainer | None = None
-    recorder: pictures.Recorder | None = None
+    recorder: pictures.TrainingPictures | None = None
     problem: AwError
     try:
         torch.set_default_dtype(torch.float32)  # whatever the method before this one left
@@ -77,7 +77,7 @@ def train_and_measure(cell: Cell, folder: Path, options: RunOptions, tick: Tick 
         trainer = _make_trainer(cell, folder, options.cache_dir, truth, first)
         if trainer.resume():
             LOG.info("going on after %s", counted(trainer.iteration, "iteration"))
-        recorder = pictures.Recorder(trainer, folder) if options.pictures else None
+        recorder = pictures.TrainingPictures(trainer, folder) if options.pictures else None
         ticks = [call for call in (recorder, tick) if call is not None]
 
         def after_iteration(trained: Trainer) -> None:
@@ -118,7 +118,7 @@ def _make_trainer(
         cache_dir=cache_dir,
         corrections=None if cell.corrections is None else cell.corrections.masks(cell.scene),
     )
-    hooks = started(
+    hooks = with_start(
         with_effects(cell.method.build(cell.options), cell.chosen.effects), cell.start, cell.scene
     )
     if first is not None:
@@ -148,7 +148,7 @@ def _measure(
     cell: Cell,
     trainer: Trainer,
     truth: list[evaluate.TestPhoto],
-    recorder: pictures.Recorder | None,
+    recorder: pictures.TrainingPictures | None,
     first: FirstPass | None,
 ) -> RunResult:
     """Write the model, renders, masks and pictures of a trained cell; return its result."""
@@ -157,7 +157,7 @@ def _measure(
     trainer.check_photos_used()
     cost = cost_of(cell, trainer)  # before the measurements below, which are no training
     if first is not None:
-        cost = both_passes(first.cost, cost)
+        cost = two_pass_cost(first.cost, cost)
     _write_model(trainer, folder / "point_cloud.ply")
     LOG.info("measuring %s", counted(len(truth), "test view"))
     per_image, missing = _measured_views(cell, trainer, truth, folder / "renders" / "test")
@@ -182,7 +182,7 @@ def _measured_views(
     cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto], folder: Path
 ) -> tuple[list[ImageRow], dict[str, str]]:
     half = cell.protocol == "half"
-    draw = evaluate.drawn_by(trainer, half)
+    draw = evaluate.trained_renderer(trainer, half)
     return evaluate.render_and_measure(draw, truth, folder, scene=cell.scene, half=half)
 
 

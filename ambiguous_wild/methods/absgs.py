@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
+from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, top_k_mask
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.optim import SplatAdam
@@ -46,7 +46,7 @@ def build(options: AbsGsConfig) -> MethodHooks:
     return MethodHooks(density=AbsDensity, density_config=options)
 
 
-class AbsoluteSums(DensityControl):
+class AbsoluteGradientSums(DensityControl):
     """Density control that also sums the absolute gradients."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"absolute"})
@@ -65,7 +65,7 @@ class AbsoluteSums(DensityControl):
         self.abs_sum += torch.where(step.rendered.visible, norms, torch.zeros_like(norms))
 
 
-class AbsDensity(AbsoluteSums):
+class AbsDensity(AbsoluteGradientSums):
     """Small Gaussians grow by the signed gradient, large ones by the absolute."""
 
     config: AbsGsConfig
@@ -77,7 +77,7 @@ class AbsDensity(AbsoluteSums):
         seen, small = self.views_seen.clamp(min=1), self.small(gaussians)
         signed = self.grad_sum / seen / max(self.config.grow_grad, 1e-12)
         score = torch.where(small, signed, self.abs_sum / seen / self.config.split_grad)
-        chosen = largest(score, score >= 1.0, self.room(step, gaussians))
+        chosen = top_k_mask(score, score >= 1.0, self.room(step, gaussians))
         return Growth.of(chosen, small)
 
     @torch.no_grad()

@@ -1,7 +1,7 @@
 """AsymGS: the model must agree with a second one that is trained under other masks.
 
-EMA-GS form (`asymgs`): the second one is a slow average of the first, and the masks change in turn. The
-average is stored with every Gaussian, so that density control changes both alike.
+EMA-GS form (`asymgs`): the second one is an exponential moving average (EMA) of the first, and the masks
+change in turn. The EMA is stored with every Gaussian, so that density control changes both alike.
 
 GS-GS form (`asymgs-twin`): two models; the first sees a photo under the hard mask, the second another photo
 under the learnt one; in both views their pictures must agree. The first is the result. A step draws four
@@ -39,14 +39,14 @@ from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks, Schedule
 from ambiguous_wild.splat.rendered import Cotangents, Frame, Gradients
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 from ambiguous_wild.vision.backends import make_features, make_instances
-from ambiguous_wild.vision.mask_ops import keep_unsuspicious, unsupported
+from ambiguous_wild.vision.mask_ops import drop_static_instances, keep_from_suspects
 from ambiguous_wild.vision.precompute import instance_labels, photo_features
 
 TWIN = "twin"
 
 
-class SlowAverage(Effect):
-    """Updates p_slow = keep p_slow + (1 - keep) p of the raw parameters after every step."""
+class ParameterEma(Effect):
+    """Updates EMA = keep EMA + (1 - keep) p of the raw parameters after every step."""
 
     name = "slow-average"
 
@@ -54,36 +54,36 @@ class SlowAverage(Effect):
         self.share = 1.0 - keep
 
     def rows(self, gaussians: Gaussians) -> Mapping[str, GaussianAttribute]:
-        return {slow(name): GaussianAttribute(tensor.clone()) for name, tensor in gaussians.items()}
+        return {ema_attribute(name): GaussianAttribute(tensor.clone()) for name, tensor in gaussians.items()}
 
     @torch.no_grad()
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
         gaussians.flush()
         for name, tensor in gaussians.items():
-            gaussians.attributes[slow(name)].lerp_(tensor, self.share)
+            gaussians.attributes[ema_attribute(name)].lerp_(tensor, self.share)
 
 
-class SlowDensity(DensityControl):
-    """Gives the average of a split's child the child's position and size, and else the parent's values."""
+class EmaDensity(DensityControl):
+    """Gives the EMA of a split's child the child's position and size, and else the parent's values."""
 
     def _split_half(self, parents: Gaussians) -> Gaussians:
         child = super()._split_half(parents)
         for name in ("means", "log_scales"):
-            if slow(name) in child.attributes:
-                child.attributes[slow(name)].copy_(getattr(child, name))
+            if ema_attribute(name) in child.attributes:
+                child.attributes[ema_attribute(name)].copy_(getattr(child, name))
         return child
 
 
-def slow(name: str) -> str:
-    """Return the name of the attribute that holds a parameter's average."""
+def ema_attribute(name: str) -> str:
+    """Return the name of the attribute that holds a parameter's EMA."""
     return f"slow_{name}"
 
 
-def slow_gaussians(gaussians: Gaussians) -> Gaussians | None:
-    """Return the average as Gaussians, which share its tensors; None if there is no average."""
-    if slow("means") not in gaussians.attributes:
+def ema_gaussians(gaussians: Gaussians) -> Gaussians | None:
+    """Return the EMA as Gaussians, which share its tensors; None if there is none."""
+    if ema_attribute("means") not in gaussians.attributes:
         return None
-    return Gaussians(*(gaussians.attributes[slow(name)] for name in PARAMETERS))
+    return Gaussians(*(gaussians.attributes[ema_attribute(name)] for name in PARAMETERS))
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class AsymGsConfig:
     instances: str = "graph"
     density: DensityConfig = field(default_factory=lambda: DensityConfig(every=1000.0, resets=()))
     warm_up: float = 1000.0  # before it soft masks do not learn, and no loss compares with the average
-    consistency: float = 0.1  # weight of mean |picture - slow picture| in the loss
+    consistency: float = 0.1  # weight of mean |picture - picture of the EMA| in the loss
     colour: float = 0.95  # quantile of the residual above which a pixel is suspect
     feature: float = 0.9  # quantile of the features' distance
     support: float = 0.1  # instances with this share of the photo's density of points are static
@@ -102,14 +102,16 @@ class AsymGsConfig:
 
 def build(options: AsymGsConfig) -> MethodHooks:
     """Return 3DGS with masks, the average as an effect, and growth that updates it."""
-    average, rates = SlowAverage(0.8), Schedule(lr_opacity=0.1)
-    return MethodHooks(AsymMask(options, average), SlowDensity, options.density, rates, effects=(average,))
+    average, rates = ParameterEma(0.8), Schedule(lr_opacity=0.1)
+    return MethodHooks(
+        AlternatingMask(options, average), EmaDensity, options.density, rates, effects=(average,)
+    )
 
 
-class AsymMask(MaskPolicy):
+class AlternatingMask(MaskPolicy):
     """Masks suspicious instances in even iterations, and by a map learnt for the photo in odd ones."""
 
-    def __init__(self, config: AsymGsConfig, average: SlowAverage | None = None) -> None:
+    def __init__(self, config: AsymGsConfig, average: ParameterEma | None = None) -> None:
         self.average = average
         self.config, self.features = config, make_features(config.features)
         self.instances = make_instances(config.instances)
@@ -119,11 +121,11 @@ class AsymMask(MaskPolicy):
         self.phi = photo_features(self.features, data.photos, data.cache_dir)
         names, least = [view.name for view in data.scene.train], self.config.support
         labelled = zip(instance_labels(self.instances, data.photos, names, data.cache_dir).labels, names)
-        suspects = (unsupported(labels, data.scene, name, least) for labels, name in labelled)
+        suspects = (drop_static_instances(labels, data.scene, name, least) for labels, name in labelled)
         self.labels = [torch.from_numpy(labels).to(data.device) for labels in suspects]
         self.soft = [RowAdam(torch.ones(1, *x.shape, device=data.device)) for x in self.labels]
 
-    def loss_effect(self) -> SlowAverage | None:
+    def loss_effect(self) -> ParameterEma | None:
         return self.average
 
     def keep(self, step: Step) -> Tensor:
@@ -154,10 +156,10 @@ class AsymMask(MaskPolicy):
         error = residual(step.photo, step.rendered.image)
         suspect = error > torch.quantile(error, self.config.colour)
         suspect &= distance > torch.quantile(distance, self.config.feature)
-        return keep_unsuspicious(nearest(self.labels[step.view], *size), suspect)
+        return keep_from_suspects(nearest(self.labels[step.view], *size), suspect)
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | None:
-        if step.nominal <= self.config.warm_up or not (teacher := slow_gaussians(step.gaussians)):
+        if step.nominal <= self.config.warm_up or not (teacher := ema_gaussians(step.gaussians)):
             return None
         apart = step.rendered.image - step.draw(gaussians=teacher).image
         return Cotangents(image=apart.sign() * (self.config.consistency / apart.numel()))
@@ -188,10 +190,10 @@ class TwinConfig(AsymGsConfig):
 def build_twin(options: TwinConfig) -> MethodHooks:
     """Return 3DGS with the hard mask, and the second model as a field that no picture shows."""
     masks, rates = HardMask(options), Schedule(lr_opacity=0.1)
-    return MethodHooks(masks, DensityControl, options.density, rates, fields=SecondModel(options, masks))
+    return MethodHooks(masks, DensityControl, options.density, rates, fields=TwinField(options, masks))
 
 
-class HardMask(AsymMask):
+class HardMask(AlternatingMask):
     """The mask of the first model; the second model uses the learnt maps."""
 
     def keep(self, step: Step) -> Tensor:
@@ -199,13 +201,13 @@ class HardMask(AsymMask):
 
     predict = keep
 
-    cotangent = MaskPolicy.cotangent  # type: ignore[assignment]  # no loss here: `SecondModel` compares the models
+    cotangent = MaskPolicy.cotangent  # type: ignore[assignment]  # no loss here: `TwinField` compares the models
 
 
-class SecondModel(Fields):
+class TwinField(Fields):
     """The second model. It is drawn beside the first and is part of no picture; both must agree."""
 
-    def __init__(self, config: TwinConfig, masks: AsymMask) -> None:
+    def __init__(self, config: TwinConfig, masks: AlternatingMask) -> None:
         self.config, self.masks = config, masks
         self._second: Camera | None = None  # camera of the second model in this step
 

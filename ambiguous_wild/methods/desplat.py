@@ -58,10 +58,10 @@ class DeSplatConfig:
 
 def build(options: DeSplatConfig) -> MethodHooks:
     """Return 3DGS with one field for each photo; its mask is what the layer leaves uncovered."""
-    return MethodHooks(fields=Layers(options), mask=LayerMask(), density_config=options.density)
+    return MethodHooks(fields=ViewLayers(options), mask=ViewLayerMask(), density_config=options.density)
 
 
-class LayerMask(MaskPolicy):
+class ViewLayerMask(MaskPolicy):
     """1 - A of the photo's layer, for pictures and metrics: the loss uses the composite instead."""
 
     def composed_keep(self, step: Step) -> Tensor | None:
@@ -72,7 +72,7 @@ class LayerMask(MaskPolicy):
         return None if layer is None else 1.0 - layer.alpha
 
 
-class Layers(Fields):
+class ViewLayers(Fields):
     """One field for each train photo."""
 
     layers = True

@@ -37,7 +37,7 @@ from ambiguous_wild.methods.external_process import (
     no_parts,
     run_logged,
     split_lists,
-    stage,
+    stage_scene,
 )
 
 _FORMATTER = string.Formatter()
@@ -69,7 +69,7 @@ def placeholders(template: str, where: str) -> set[str]:
     return names
 
 
-def check(template: str, known: Iterable[str], where: str) -> set[str]:
+def check_placeholders(template: str, known: Iterable[str], where: str) -> set[str]:
     """Return the placeholders of a template.
 
     Raises:
@@ -81,7 +81,7 @@ def check(template: str, known: Iterable[str], where: str) -> set[str]:
     return names
 
 
-def fill(template: str, values: Mapping[str, object]) -> str:
+def fill_template(template: str, values: Mapping[str, object]) -> str:
     """Fill in a template; a value stays within the argument that holds its placeholder."""
     try:
         return _FORMATTER.vformat(template, (), values)
@@ -92,7 +92,7 @@ def fill(template: str, values: Mapping[str, object]) -> str:
 def fill_pattern(template: str, values: Mapping[str, object]) -> str:
     """Fill in a glob pattern: wildcards of the template work, those in values are plain text."""
     escaped = {k: glob.escape(v) if isinstance(v, str) else v for k, v in values.items()}
-    return fill(template, escaped)
+    return fill_template(template, escaped)
 
 
 @dataclass(frozen=True)
@@ -140,9 +140,9 @@ class CommandProgram:
         for word in dict.fromkeys(words):
             if placeholders(f"{word}{path or ''}", self.name) - values.keys():
                 continue  # its value is known only in a run
-            program = fill(word, values)
+            program = fill_template(word, values)
             where = self.cwd / program if os.path.dirname(program) else program
-            if shutil.which(where, path=path and fill(path, values)) is None:
+            if shutil.which(where, path=path and fill_template(path, values)) is None:
                 return program
         return ""
 
@@ -155,8 +155,8 @@ class CommandProgram:
         self._check_length(task)
         end_left_over(task.logs)
         lists = split_lists(task.scene)
-        files = {name: fill(text, lists) for name, text in self.scene_files.items()}
-        staged = stage(task.scene, task.folder / ".scene", files, photos=self.keys.photos)
+        files = {name: fill_template(text, lists) for name, text in self.scene_files.items()}
+        staged = stage_scene(task.scene, task.folder / ".scene", files, photos=self.keys.photos)
         try:
             values = self._values(task, staged)
             state = task.work / DONE
@@ -222,10 +222,10 @@ class CommandProgram:
     def _command(self, step: str, key: str, values: dict[str, object], task: Task) -> float:
         return run_logged(
             f"{step} of {self.name}",
-            [*self.words("prefix"), *(fill(argument, values) for argument in self.words(key))],
+            [*self.words("prefix"), *(fill_template(argument, values) for argument in self.words(key))],
             log=task.logs / f"{step}.log",
             cwd=self.cwd,
-            environment={name: fill(text, values) for name, text in self.environment.items()},
+            environment={name: fill_template(text, values) for name, text in self.environment.items()},
             timeout_s=self.keys.timeout_h * 3600.0 or None,
         )
 
@@ -423,13 +423,13 @@ def _check(program: CommandProgram, options: set[str], path: Path) -> None:
     run = {*RUN, *options}
     for key in (*COMMANDS, "version"):
         for argument in program.words(key):
-            check(argument, run, f"{path}, {key}")
+            check_placeholders(argument, run, f"{path}, {key}")
     for name, value in program.environment.items():
-        check(value, run, f"{path}, environment {name}")
+        check_placeholders(value, run, f"{path}, environment {name}")
     for name, value in program.scene_files.items():
-        check(value, LISTS, f"{path}, scene_files {name}")
+        check_placeholders(value, LISTS, f"{path}, scene_files {name}")
     for key, known in (("renders", run | {*VIEW}), ("masks", run | {*VIEW}), ("ply", run)):
-        check(getattr(keys, key), known, f"{path}, {key}")
+        check_placeholders(getattr(keys, key), known, f"{path}, {key}")
     if keys.renders and not {*VIEW} & placeholders(keys.renders, "renders"):
         raise AwError(f"{path}: renders must hold {{stem}}, {{name}} or {{index}}: one file a test photo")
     if not program.cwd.is_dir():

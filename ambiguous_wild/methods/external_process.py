@@ -39,7 +39,7 @@ _RECORD = ".running.json"  # record of a running command, beside its log
 _TAIL_LINES = 4
 
 
-def stage(scene: Scene, folder: Path, files: Mapping[str, str], *, photos: Photos = "all") -> Path:
+def stage_scene(scene: Scene, folder: Path, files: Mapping[str, str], *, photos: Photos = "all") -> Path:
     """Make the copy of the scene that a program gets.
 
     Args:

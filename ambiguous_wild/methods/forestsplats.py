@@ -27,7 +27,7 @@ from ambiguous_wild.methods.dronesplat import label_means
 from ambiguous_wild.methods.masking_common import EffectMask, d_keep, resized
 from ambiguous_wild.methods.wildgaussians import WildAppearance, WildGaussiansConfig
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import AutogradEffect, Leaf, mlp_leaves
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.geometry import SceneNormaliser, conv_leaves, frequencies
 from ambiguous_wild.splat.field import Rates
@@ -64,7 +64,7 @@ class ForestSplatsConfig:
         check_limits(self, "forestsplats", filled=(0, 1), **limits)
 
 
-class Nets(Learnt):
+class ForestSplatsNets(AutogradEffect):
     """Holds the deforming net and the mask net. As an effect it changes no picture itself."""
 
     name = "forestsplats"
@@ -140,10 +140,10 @@ class Nets(Learnt):
     def filled(self, mask: Tensor, view: int) -> Tensor:
         """Return M_f [H, W]: the largest value in superpixels whose mean reaches `filled`, elsewhere M."""
         segments = F.interpolate(self.segments[view][None, None].float(), size=mask.shape)[0, 0].long()
-        return fill(mask, segments, 2 * self.config.segments, self.config.filled)
+        return fill_superpixels(mask, segments, 2 * self.config.segments, self.config.filled)
 
 
-def fill(mask: Tensor, segments: Tensor, count: int, share: float) -> Tensor:
+def fill_superpixels(mask: Tensor, segments: Tensor, count: int, share: float) -> Tensor:
     """Replace the mask [H, W] by its maximum in segments [H, W] whose mean is `share` or more."""
     flat = segments.reshape(-1)
     most = torch.zeros(count, device=mask.device).scatter_reduce(0, flat, mask.reshape(-1), "amax")
@@ -153,20 +153,25 @@ def fill(mask: Tensor, segments: Tensor, count: int, share: float) -> Tensor:
 
 def build(options: ForestSplatsConfig) -> MethodHooks:
     """Return a static and a transient field, mixed by the mask."""
-    nets = Nets(options)
+    nets = ForestSplatsNets(options)
     effects: tuple[Effect, ...] = (nets,)
     if options.appearance:
         effects = (nets, WildAppearance(WildGaussiansConfig()))
-    return MethodHooks(mask=Mixed(nets), density_config=options.density, fields=Forest(nets), effects=effects)
+    return MethodHooks(
+        mask=ForestSplatsMask(nets),
+        density_config=options.density,
+        fields=ForestSplatsFields(nets),
+        effects=effects,
+    )
 
 
-class Forest(Fields):
+class ForestSplatsFields(Fields):
     """Composes C = M_f R_t + (1 - M_f) R_s of the transient and the static render."""
 
-    def __init__(self, nets: Nets) -> None:
+    def __init__(self, nets: ForestSplatsNets) -> None:
         self.nets, self.config = nets, nets.config
 
-    def required_effect(self) -> Nets:
+    def required_effect(self) -> ForestSplatsNets:
         return self.nets
 
     def setup(self, data: TrainData, static: Gaussians, rates: Rates) -> Mapping[str, FieldStart]:
@@ -232,11 +237,11 @@ class Forest(Fields):
         return {STATIC: of_static, TRANSIENT: Cotangents(image=d_transient)}
 
 
-class Mixed(EffectMask):
+class ForestSplatsMask(EffectMask):
     """1 - M_f, for pictures and metrics: the loss uses the mixture instead."""
 
-    def __init__(self, nets: Nets) -> None:
-        self.effect, self.forest = nets, Forest(nets)
+    def __init__(self, nets: ForestSplatsNets) -> None:
+        self.effect, self.forest = nets, ForestSplatsFields(nets)
 
     def composed_keep(self, step: Step) -> Tensor | None:
         return self.predict(step)

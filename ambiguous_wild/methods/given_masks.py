@@ -1,4 +1,4 @@
-"""Mask policies of other sources: fixed masks of a first pass, or masks and losses of two methods."""
+"""Fixed masks of a first pass, and policies grafted from masks and losses of two methods."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class FixedMasks(MaskPolicy):
         return {"masked_share": sum(shares) / max(len(shares), 1)}
 
 
-class GraftedPolicy(MaskPolicy):
+class GraftedMaskPolicy(MaskPolicy):
     """Keep maps, pictures and facts of `mask`; cotangents of `regulariser`, if there is one."""
 
     def __init__(self, mask: MaskPolicy, regulariser: MaskPolicy | None) -> None:
@@ -107,6 +107,6 @@ class GraftedPolicy(MaskPolicy):
 
 def makes_masks(hooks: MethodHooks) -> bool:
     """Return whether the method's mask policy, without a grafted regulariser, masks anything."""
-    policy = hooks.mask.mask if isinstance(hooks.mask, GraftedPolicy) else hooks.mask
+    policy = hooks.mask.mask if isinstance(hooks.mask, GraftedMaskPolicy) else hooks.mask
     kind = type(policy)
     return kind.keep is not MaskPolicy.keep or kind.predict is not MaskPolicy.predict

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from ambiguous_wild.core.errors import AwError, unknown
 from ambiguous_wild.methods.entry import MethodEntry, trained_once
-from ambiguous_wild.methods.references import is_program, is_reference, reference_file, with_file
+from ambiguous_wild.methods.references import is_program, is_reference, reference_file, replace_reference_file
 
 if TYPE_CHECKING:
     from ambiguous_wild.methods.graft_checks import Member
@@ -60,17 +60,17 @@ def split_graft(name: str) -> tuple[str, str]:
     return host, rest
 
 
-def with_files(name: str, moved: Callable[[Path], Path]) -> str:
+def replace_reference_files(name: str, moved: Callable[[Path], Path]) -> str:
     """Return the name of a method with other paths of the files that it, or its donors, are recipes in."""
     once = trained_once(name)
     if is_reference(once):
         file = reference_file(once)
-        return name if file is None else with_file(once, moved(file)) + name.removeprefix(once)
+        return name if file is None else replace_reference_file(once, moved(file)) + name.removeprefix(once)
     host, rest = split_graft(once)
     if not rest:
         return name
-    donors = {slot: with_files(donor, moved) for slot, donor in graft_pairs(once)}
-    return graft_name(with_files(host, moved), donors) + name.removeprefix(once)
+    donors = {slot: replace_reference_files(donor, moved) for slot, donor in graft_pairs(once)}
+    return graft_name(replace_reference_files(host, moved), donors) + name.removeprefix(once)
 
 
 def refuse_parts_of_program(name: str) -> None:
@@ -174,7 +174,7 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Method
     check_members(host_member, donors)
     host = host_member.hooks
     mask, regulariser = (donors.get(slot, host_member).hooks.mask for slot in ("mask", "regulariser"))
-    host = dataclasses.replace(host, mask=compose(mask, regulariser))
+    host = dataclasses.replace(host, mask=combine_policies(mask, regulariser))
     if "density" in donors:
         density = donors["density"].hooks
         host = dataclasses.replace(
@@ -190,7 +190,7 @@ def build(name: str, entries: Mapping[str, MethodEntry], options: Any) -> Method
         return host
     effects = donors["effects"].hooks.effects
     for effect in effects:
-        host = host.suited_to(effect)
+        host = host.with_effect(effect)
     return dataclasses.replace(host, effects=effects)
 
 
@@ -210,14 +210,14 @@ def _members(name: str, entries: Mapping[str, MethodEntry], options: Any) -> tup
     return members.pop("host"), members
 
 
-def compose(mask: Any, regulariser: Any) -> Any:
+def combine_policies(mask: Any, regulariser: Any) -> Any:
     """Join two policies to one: keep maps of `mask`, losses of `regulariser`."""
-    from ambiguous_wild.methods.given_masks import GraftedPolicy
+    from ambiguous_wild.methods.given_masks import GraftedMaskPolicy
 
     if regulariser is mask:
         return mask
     # a donor of masks does not add its own loss
-    return GraftedPolicy(mask, regulariser if regulariser.regularises() else None)
+    return GraftedMaskPolicy(mask, regulariser if regulariser.regularises() else None)
 
 
 def check_graft(method: MethodEntry, options: Any) -> list[str]:
@@ -228,7 +228,7 @@ def check_graft(method: MethodEntry, options: Any) -> list[str]:
     Raises:
         AwError: the graft cannot train, or would change nothing.
     """
-    from ambiguous_wild.methods.graft_checks import NOTHING, check_members, left_out
+    from ambiguous_wild.methods.graft_checks import NOTHING, check_members, omitted_effect_warnings
 
     recipe = method.recipe
     if not isinstance(recipe, Graft):
@@ -238,7 +238,7 @@ def check_graft(method: MethodEntry, options: Any) -> list[str]:
     except Exception:
         return []
     check_members(host, donors)
-    warnings, losses = left_out(host, donors), donors.get("regulariser")
+    warnings, losses = omitted_effect_warnings(host, donors), donors.get("regulariser")
     if losses is not None and losses.name not in NOTHING and not losses.hooks.mask.regularises():
         warnings.append(
             f"{losses.name} adds no loss on the render with these options; "

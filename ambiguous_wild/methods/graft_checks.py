@@ -42,7 +42,7 @@ def check_members(host: Member, donors: Mapping[str, Member]) -> None:
     _check_required_effects(host, donors)
 
 
-def left_out(host: Member, donors: Mapping[str, Member]) -> list[str]:
+def omitted_effect_warnings(host: Member, donors: Mapping[str, Member]) -> list[str]:
     """Return warnings about effects of donors of masks or losses that the graft lacks."""
     if "effects" in donors:
         return []

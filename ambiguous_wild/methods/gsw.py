@@ -27,13 +27,19 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.methods.masking_common import EffectMask, d_keep, hashed_uniform
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import (
+    AutogradEffect,
+    Leaf,
+    VisibleGaussians,
+    mlp,
+    mlp_leaves,
+)
 from ambiguous_wild.splat.effects.geometry import (
     SceneNormaliser,
     conv_leaves,
     directions,
     frequencies,
-    mean_of_seen,
+    mean_of_visible,
     projected,
     with_penalty,
 )
@@ -62,7 +68,7 @@ def unet_leaves(width: int, rng: np.random.Generator, rate: float) -> dict[str, 
     return {k: v for n, c in widths.items() for k, v in conv_leaves(n, c, rng, rate, final=0.1).items()}
 
 
-def coded(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> list[Tensor]:
+def encode_photo(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> list[Tensor]:
     """Return the photo at `side` and the three levels of the encoder, [1, C, h, w] each."""
     share = min(side / max(photo.shape[:2]), 1.0)
     size = [max(8 * round(side * share / 8), 8) for side in photo.shape[:2]]
@@ -72,18 +78,18 @@ def coded(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> list[Tensor]:
     return levels
 
 
-def maps_of(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> Tensor:
+def feature_maps(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> Tensor:
     """Return maps [3, 16, h, w]: two to sample at learnt places, one at the Gaussian's pixel."""
-    _, fine, middle, coarse = coded(photo, leaf, side)
+    _, fine, middle, coarse = encode_photo(photo, leaf, side)
     x = torch.cat([F.interpolate(coarse, size=middle.shape[2:]), middle], dim=1)
     x = _normal(_conv(x, leaf, "up"))
     x = torch.cat([F.interpolate(x, size=fine.shape[2:]), fine], dim=1)
     return _conv(x, leaf, "top").reshape(FREE + 1, CHANNELS, *fine.shape[2:])
 
 
-def visibility(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> Tensor:
+def visibility_map(photo: Tensor, leaf: Mapping[str, Tensor], side: int) -> Tensor:
     """Return M [H, W] in (0, 1), 1 = static, from the encoder's last level."""
-    x = F.interpolate(_normal(_conv(coded(photo, leaf, side)[3], leaf, "mask")), scale_factor=2.0)
+    x = F.interpolate(_normal(_conv(encode_photo(photo, leaf, side)[3], leaf, "mask")), scale_factor=2.0)
     x = torch.sigmoid(_conv(x, leaf, "mask", 1))
     return F.interpolate(x, size=photo.shape[:2])[0, 0]
 
@@ -127,12 +133,12 @@ def build(options: GswConfig) -> MethodHooks:
     """Return 3DGS with such colours, masks of the same U-Net, and a higher threshold of growth."""
     effect = GswAppearance(options)
     return MethodHooks(
-        mask=Visibility(effect), density_config=options.density, weighting="images",
+        mask=VisibilityMask(effect), density_config=options.density, weighting="images",
         schedule=Schedule(lr_means_final=1.6e-7), effects=(effect,),
     )  # fmt: skip
 
 
-class GswAppearance(Learnt):
+class GswAppearance(AutogradEffect):
     """Colours Gaussians by net(position, intrinsic feature, samples of three maps, direction)."""
 
     name, reads_photo = "gs-w", True
@@ -174,14 +180,16 @@ class GswAppearance(Learnt):
             "gsw_box": GaussianAttribute(torch.ones(len(means), 2, device=means.device), box, box / 100),
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo, means = self._seen(context), visible.means.detach()
         intrinsic = visible.attributes["gsw_intrinsic"]
-        maps = self._mean_maps(context, leaf) if photo is None else maps_of(photo, leaf, self.config.side)
+        maps = (
+            self._mean_maps(context, leaf) if photo is None else feature_maps(photo, leaf, self.config.side)
+        )
         places, box = visible.attributes["gsw_places"], visible.attributes["gsw_box"]
         free = [sample(maps[k], places[:, 2 * k : 2 * k + 2]) for k in range(FREE)]
         width = context.camera.width // 2 if context.fitting else context.camera.width  # of the picture read
-        own, inside = at_pixels(maps[FREE], means, context.camera, width, box)
+        own, inside = sample_at_projections(maps[FREE], means, context.camera, width, box)
         if context.fitting or photo is None:
             usual = self._usual(context, leaf, means, box)
             own = usual if photo is None else torch.where(inside[:, None], own, usual)
@@ -198,7 +206,7 @@ class GswAppearance(Learnt):
         colours = 0.5 + mlp(torch.cat([hidden, directions(means, context.camera)], dim=1), leaf, "head")
         if self.config.residual:
             colours = colours + SH_C0 * intrinsic[:, :3]
-        beyond = mean_of_seen(F.relu(places.abs() - 1.0), means, context.camera)
+        beyond = mean_of_visible(F.relu(places.abs() - 1.0), means, context.camera)
         return with_penalty(colours, self.config.outside * beyond)
 
     def _seen(self, context: ViewContext) -> Tensor | None:
@@ -211,7 +219,7 @@ class GswAppearance(Learnt):
     def _maps(self, context: ViewContext, leaf: Mapping[str, Tensor]) -> list[Tensor]:
         """Return maps of at most `MAX_AVERAGED` train photos, evenly chosen; computed once an iteration."""
         if self._cached is None or self._cached[0] != context.nominal:
-            maps = [maps_of(self.all_photos[k], leaf, self.config.side) for k in self.chosen]
+            maps = [feature_maps(self.all_photos[k], leaf, self.config.side) for k in self.chosen]
             self._cached = context.nominal, maps
         return self._cached[1]
 
@@ -227,7 +235,9 @@ class GswAppearance(Learnt):
         """Return the mean sample of each Gaussian in the train photos that show it, [M, 16]."""
         total, count = means.new_zeros(len(means), CHANNELS), means.new_zeros(len(means), 1)
         for k, maps in zip(self.chosen, self._maps(context, leaf)):
-            own, inside = at_pixels(maps[FREE], means, self.cameras[k], self.cameras[k].width, box)
+            own, inside = sample_at_projections(
+                maps[FREE], means, self.cameras[k], self.cameras[k].width, box
+            )
             total, count = total + own * inside[:, None], count + inside[:, None].float()
         return total / count.clamp(min=1.0)
 
@@ -244,7 +254,9 @@ class GswAppearance(Learnt):
         return {name: value.requires_grad_() for name, value in self._leaf(context).items()}
 
 
-def at_pixels(maps: Tensor, means: Tensor, camera: Camera, width: int, box: Tensor) -> tuple[Tensor, Tensor]:
+def sample_at_projections(
+    maps: Tensor, means: Tensor, camera: Camera, width: int, box: Tensor
+) -> tuple[Tensor, Tensor]:
     """Sample a map [16, h, w] at the pixels of Gaussians in a camera.
 
     Args:
@@ -262,7 +274,7 @@ def at_pixels(maps: Tensor, means: Tensor, camera: Camera, width: int, box: Tens
     return sample(maps, 2.0 * at - 1.0), inside
 
 
-class Visibility(EffectMask):
+class VisibilityMask(EffectMask):
     """Masks by M, which learns from the weighted residual and the prior that nothing is masked."""
 
     effect: GswAppearance
@@ -276,14 +288,14 @@ class Visibility(EffectMask):
 
     @torch.no_grad()
     def predict(self, step: Step) -> Tensor:
-        return visibility(step.photo, self.effect._leaf(step), self.config.side)
+        return visibility_map(step.photo, self.effect._leaf(step), self.config.side)
 
     def cotangent(self, step: Step, keep: Tensor | None) -> Cotangents | None:
         if keep is None or step.nominal <= self.config.mask_start:
             return None
         with torch.enable_grad():
             leaf = self.effect.learnable(step)
-            mask = visibility(step.photo, leaf, self.config.side)
+            mask = visibility_map(step.photo, leaf, self.config.side)
             d_leaves = torch.autograd.grad(
                 mask, list(leaf.values()), self.d_mask(step, mask.detach()), allow_unused=True
             )

@@ -22,7 +22,7 @@ from torch import Tensor
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.masking_common import CountingMask, EffectMask, MaskedShares
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt
+from ambiguous_wild.splat.effects.autograd_effect import AutogradEffect, Leaf
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import Cotangents
@@ -50,11 +50,11 @@ class HybridGsConfig:
 
 def build(options: HybridGsConfig) -> MethodHooks:
     """Return 3DGS with a layer of each photo over its picture."""
-    plane = Plane(options)
-    return MethodHooks(mask=PlaneMask(plane), density_config=options.density, effects=(plane,))
+    plane = PlanarLayer(options)
+    return MethodHooks(mask=PlanarLayerMask(plane), density_config=options.density, effects=(plane,))
 
 
-class Plane(Learnt):
+class PlanarLayer(AutogradEffect):
     """Draws clip(T + (1 - M) S) from `joint` on, with T and M sums of the photo's 2D Gaussians."""
 
     name = "hybridgs"
@@ -83,21 +83,21 @@ class Plane(Learnt):
     def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         if context.view is None or context.other_gaussians or context.nominal < self.config.joint:
             return image
-        return composed(*self.layer(leaf["planar"], context), image)
+        return composite_over(*self.layer(leaf["planar"], context), image)
 
 
-def composed(front: Tensor, mask: Tensor, back: Tensor) -> Tensor:
+def composite_over(front: Tensor, mask: Tensor, back: Tensor) -> Tensor:
     """Return clip(T + (1 - M) S, 0, 1)."""
     return (front + (1.0 - mask)[..., None] * back.clamp(0.0, 1.0)).clamp(0.0, 1.0)
 
 
-class PlaneMask(EffectMask, CountingMask):
+class PlanarLayerMask(EffectMask, CountingMask):
     """1 - M, which weights the loss while both kinds learn separately; afterwards the picture contains M."""
 
-    effect: Plane
+    effect: PlanarLayer
     learns_by_gradients = True
 
-    def __init__(self, plane: Plane) -> None:
+    def __init__(self, plane: PlanarLayer) -> None:
         self.effect, self.config, self.shares = plane, plane.config, MaskedShares()
 
     def keep(self, step: Step) -> Tensor | None:
@@ -123,7 +123,7 @@ class PlaneMask(EffectMask, CountingMask):
             front, mask = self.effect.layer(planar, step)
             outputs, cotangents = [mask], [torch.full_like(mask, self.config.area / mask.numel())]
             if step.nominal < self.config.joint:
-                picture = composed(front, mask, step.rendered.image.detach())
+                picture = composite_over(front, mask, step.rendered.image.detach())
                 outputs.append(picture)
                 cotangents.append(photometric(picture.detach(), step.photo, self._user(keep, mask)).d_image)
             (d_planar,) = torch.autograd.grad(outputs, planar, cotangents)

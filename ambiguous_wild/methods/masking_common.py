@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.splat.effects.autograd_effect import Learnt
+from ambiguous_wild.splat.effects.autograd_effect import AutogradEffect
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.method_hooks import MaskPolicy
 from ambiguous_wild.splat.step import Step, TrainData
@@ -72,7 +72,7 @@ def percentile(histogram: Tensor, share: float) -> float | Tensor:
     return backend_of(histogram.device).number(edge)
 
 
-def bound(e: Tensor, threshold: float | Tensor) -> Tensor:
+def inlier_map(e: Tensor, threshold: float | Tensor) -> Tensor:
     """Return 1 where e < threshold for the pixel or for over half of its 3x3 window; outside counts as 0."""
     inlier = (e < threshold).float()
     near = F.avg_pool2d(inlier[None, None], 3, stride=1, padding=1)[0, 0]
@@ -163,9 +163,9 @@ class PausingMask(WarmUpMask):
 class EffectMask(MaskPolicy):
     """A mask policy that reads an effect, which the run must have."""
 
-    effect: Learnt
+    effect: AutogradEffect
 
-    def required_effect(self) -> Learnt:
+    def required_effect(self) -> AutogradEffect:
         return self.effect
 
     def setup(self, data: TrainData) -> None:
@@ -255,7 +255,7 @@ def annealed(step: Step, rate: float) -> float:
     return math.exp(-rate * math.floor((1.0 + s) / 1.5))
 
 
-def initialise(layers: Sequence[tuple[nn.Module, float]], seed: int) -> None:
+def init_uniform(layers: Sequence[tuple[nn.Module, float]], seed: int) -> None:
     """Draw weights and biases of each layer from -limit to limit, with numbers from the host.
 
     They are the same on every device.
@@ -288,7 +288,7 @@ class MaskNet(nn.Module):
         self.register_buffer("std", std.clone())
         self.first = nn.Linear(len(mean), hidden, device=mean.device)
         self.last = nn.Linear(hidden, 1, device=mean.device)
-        initialise([(layer, layer.in_features**-0.5) for layer in (self.first, self.last)], seed)
+        init_uniform([(layer, layer.in_features**-0.5) for layer in (self.first, self.last)], seed)
 
     def forward(self, features: Tensor, height: int, width: int) -> Tensor:
         """Return the map [height, width].
@@ -298,11 +298,11 @@ class MaskNet(nn.Module):
         """
         z = self.first((features - self.mean) / self.std)
         if z.shape[:2] != (height, width):
-            z = enlarged(z, height, width)
+            z = upsampled(z, height, width)
         return torch.sigmoid(self.last(F.relu(z)).squeeze(2))
 
 
-def enlarged(z: Tensor, height: int, width: int) -> Tensor:
+def upsampled(z: Tensor, height: int, width: int) -> Tensor:
     """Enlarge [h, w, C] to [height, width, C], bilinear, with pixel centres in place (not align_corners).
 
     Two products with small matrices: with many channels on the CPU a third of the cost of `F.interpolate`

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.splat.density import DensityConfig, DensityControl, shaped
+from ambiguous_wild.splat.density import DensityConfig, DensityControl, covariance_offsets
 from ambiguous_wild.splat.gaussians import Gaussians, rotation_matrices
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.optim import SplatAdam
@@ -60,7 +60,7 @@ def build(options: McmcConfig) -> MethodHooks:
     )  # fmt: skip
 
 
-def divided(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+def relocation(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
     """Return opacity [n] and scale factor [n] with which m `copies` [n] look like one Gaussian."""
     # o' = 1 - (1 - o)^(1/m), D = sum_i sum_k C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1), summed over i first
     o, m, k = opacity.double(), copies.clamp(max=51), np.arange(1, 52)
@@ -120,14 +120,14 @@ class McmcDensity(DensityControl):
         if not self.config.apart:
             return torch.zeros_like(g.means)
         noise = torch.from_numpy(self.rng.standard_normal((len(g), 3), dtype=np.float32)).to(g.device)
-        return self.config.apart * shaped(noise, g)
+        return self.config.apart * covariance_offsets(noise, g)
 
     def _draw(self, g: Gaussians, optimiser: SplatAdam, among: Tensor, count: int) -> Tensor:
         """Draw rows [count] by opacity; their opacity and scale become those of the copies."""
         share = torch.where(among, torch.sigmoid(g.opacity_logits), 0.0).double().cpu().numpy()
         drawn = torch.from_numpy(self.rng.choice(len(share), count, p=share / share.sum())).to(g.device)
         rows, times = drawn.unique(return_counts=True)
-        opacity, factor = divided(torch.sigmoid(g.opacity_logits[rows]), 1 + times)
+        opacity, factor = relocation(torch.sigmoid(g.opacity_logits[rows]), 1 + times)
         g.opacity_logits[rows] = torch.logit(opacity)
         g.log_scales[rows] += factor.log()[:, None]
         optimiser.reset_moments(list(optimiser.rates), rows)

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import check_limits
-from ambiguous_wild.methods.absgs import AbsoluteSums
-from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, largest
-from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes, widened
+from ambiguous_wild.methods.absgs import AbsoluteGradientSums
+from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth, top_k_mask
+from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes, filtered_variances
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
@@ -47,7 +47,7 @@ def build(options: MipConfig) -> MethodHooks:
 
 def opacity_factor(log_scales: Tensor, size: Tensor) -> Tensor:
     """Return the factor [N] of opacities under a filter of size f [N]: sqrt(prod s^2 / prod (s^2 + f^2))."""
-    return widened(log_scales, size)[1].prod(dim=1).sqrt()
+    return filtered_variances(log_scales, size)[1].prod(dim=1).sqrt()
 
 
 class MipDensity(DensityControl):
@@ -64,7 +64,7 @@ class MipDensity(DensityControl):
         gaussians.opacity_logits.copy_(torch.logit((target / factor).clamp(1e-7, 1 - 1e-6)))
 
 
-class AbsoluteMipDensity(AbsoluteSums, MipDensity):
+class AbsoluteMipDensity(AbsoluteGradientSums, MipDensity):
     """Density control that also grows by the absolute gradient, as many Gaussians as by the signed one."""
 
     order = 1
@@ -74,12 +74,12 @@ class AbsoluteMipDensity(AbsoluteSums, MipDensity):
         signed, absolute = self.grad_sum / seen, self.abs_sum / seen
         growing = signed >= self.config.grow_grad
         share = float(growing.float().mean())
-        limit = matched(absolute, share)
+        limit = upper_quantile(absolute, share)
         score = torch.maximum(signed / max(self.config.grow_grad, 1e-12), absolute / max(limit, 1e-12))
-        chosen = largest(score, growing | (absolute >= limit), self.room(step, gaussians))
+        chosen = top_k_mask(score, growing | (absolute >= limit), self.room(step, gaussians))
         return Growth.of(chosen, small)
 
 
-def matched(absolute: Tensor, share: float) -> float:
+def upper_quantile(absolute: Tensor, share: float) -> float:
     """Return the threshold that this share of the values [N] reaches: their (1 - share) quantile."""
     return float(np.quantile(absolute.cpu().numpy(), 1.0 - share))

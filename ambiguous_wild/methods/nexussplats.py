@@ -35,7 +35,13 @@ from ambiguous_wild.methods.masking_common import (
 from ambiguous_wild.methods.wildgaussians import FeatureDistance, noisy_fourier
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import (
+    AutogradEffect,
+    Leaf,
+    VisibleGaussians,
+    mlp,
+    mlp_leaves,
+)
 from ambiguous_wild.splat.effects.geometry import directions, in_picture
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
@@ -85,12 +91,12 @@ class NexusSplatsConfig:
 
 def build(options: NexusSplatsConfig) -> MethodHooks:
     """Return 3DGS without resets, with colours and uncertainty from codes."""
-    codes = Codes(options)
-    control = type("NexusDensity", (SmallVolumes,), {"weight": options.volume})
-    return MethodHooks(DrawnUncertainty(codes), control, options.density, effects=(codes,))
+    codes = NexusSplatsColours(options)
+    control = type("NexusDensity", (VolumeRegularisedDensity,), {"weight": options.volume})
+    return MethodHooks(RenderedUncertainty(codes), control, options.density, effects=(codes,))
 
 
-class Codes(Learnt):
+class NexusSplatsColours(AutogradEffect):
     """The codes of photos and Gaussians, and both nets."""
 
     name = "nexussplats"
@@ -126,7 +132,7 @@ class Codes(Learnt):
             "nexus_uncertainty": GaussianAttribute(uncertainty, self.config.lr_code),
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo = leaf["light"].expand(len(visible.base), CODE)
         towards = directions(visible.means.detach(), context.camera)
         inputs = torch.cat([visible.base, visible.attributes["nexus_light"], photo, towards], dim=1)
@@ -149,14 +155,14 @@ class Codes(Learnt):
         return mlp(torch.cat([codes, photo], dim=1), leaf, "uncertainty")[:, 0]
 
 
-class DrawnUncertainty(EffectMask, CountingMask, WarmUpMask):
+class RenderedUncertainty(EffectMask, CountingMask, WarmUpMask):
     """Keeps pixels where the drawn uncertainty gives a weight above 1."""
 
     config: NexusSplatsConfig
-    effect: Codes
+    effect: NexusSplatsColours
     learns_by_gradients = True
 
-    def __init__(self, codes: Codes) -> None:
+    def __init__(self, codes: NexusSplatsColours) -> None:
         self.effect, self.config = codes, codes.config
         self.distance = FeatureDistance(self.config.features, self.config.normal_units)
         self.shares = MaskedShares()
@@ -171,7 +177,7 @@ class DrawnUncertainty(EffectMask, CountingMask, WarmUpMask):
         weight, self.pending = self._weight(step, learn=True)
         if not self.begun(step):
             return None
-        keep = kept(weight)
+        keep = confident_pixels(weight)
         self.shares.take(step.view, keep)
         return keep
 
@@ -180,7 +186,7 @@ class DrawnUncertainty(EffectMask, CountingMask, WarmUpMask):
         return gradients
 
     def predict(self, step: Step) -> Tensor | None:
-        return kept(self._weight(step, learn=False)[0]) if self.begun(step) else None
+        return confident_pixels(self._weight(step, learn=False)[0]) if self.begun(step) else None
 
     def _weight(self, step: Step, learn: bool) -> tuple[Tensor, Gradients | None]:
         """Return w = 1 / (2 sigma^2) [H, W] of the drawn uncertainty, and gradients of its loss."""
@@ -199,7 +205,7 @@ class DrawnUncertainty(EffectMask, CountingMask, WarmUpMask):
             weight = 0.5 / sigma.square()
         judged = weight.detach()
         if self.config.boundary:
-            judged = judged / boundary(judged.shape[0], judged.shape[1], judged)
+            judged = judged / boundary_weight(judged.shape[0], judged.shape[1], judged)
         if not learn:
             return judged, None
         with torch.enable_grad():
@@ -232,8 +238,8 @@ class DrawnUncertainty(EffectMask, CountingMask, WarmUpMask):
         return super().facts() | {"features": self.distance.name}
 
 
-def kept(weight: Tensor) -> Tensor:
-    """Keep pixels with a weight above 1; a photo without such a pixel is kept whole, or nothing is learnt."""
+def confident_pixels(weight: Tensor) -> Tensor:
+    """Keep pixels with a weight above 1; a photo without such pixels is kept whole."""
     static = weight > 1.0
     return torch.where(static.any(), static, True).float()
 
@@ -245,14 +251,14 @@ def as_colour(gaussians: Gaussians, rows: Any, values: Tensor) -> Gaussians:
     return replace(gaussians, sh0=colours, sh_rest=gaussians.sh_rest[:, :0], attributes={})
 
 
-def boundary(height: int, width: int, like: Tensor) -> Tensor:
+def boundary_weight(height: int, width: int, like: Tensor) -> Tensor:
     """Return G [H, W] = exp(-((r - 0.5)^2 / (2 0.5^2) + c^2 / (2 0.8^2))) at rows, columns in [-1, 1]."""
     r = torch.linspace(-1, 1, height, device=like.device)[:, None]
     c = torch.linspace(-1, 1, width, device=like.device)[None, :]
     return torch.exp(-((r - 0.5) ** 2 / 0.5 + c**2 / 1.28))
 
 
-class SmallVolumes(DensityControl):
+class VolumeRegularisedDensity(DensityControl):
     """Density control of 3DGS, with a loss of `weight` times the mean volume (product of the scales)."""
 
     weight = 0.0

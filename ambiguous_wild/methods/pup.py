@@ -59,7 +59,7 @@ def log_det(blocks: Tensor) -> Tensor:
     return torch.linalg.slogdet(blocks + 1e-12 * torch.eye(6).to(blocks))[1]
 
 
-def removed(score: Tensor, share: float) -> Tensor:
+def prune_mask(score: Tensor, share: float) -> Tensor:
     """Return rows up to the score at index int(share (N - 1)), with ties, as the released code, [N] bool."""
     return score <= score.sort().values[int(share * (len(score) - 1))]
 
@@ -86,7 +86,7 @@ class PupDensity(DensityControl):
         drop = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
         mutable = self.mutable_rows(~drop, gaussians)
         if bool(mutable.any()):
-            drop[mutable] = removed(score[mutable], share)  # a share of those that may be removed
+            drop[mutable] = prune_mask(score[mutable], share)  # a share of those that may be removed
         if self.leaves_only_protected(drop, gaussians):
             return gaussians, events
         optimiser.flush()

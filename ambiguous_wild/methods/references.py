@@ -110,7 +110,7 @@ def _has(folder: Path, module: str) -> bool:
 
 def _imported_later(path: Path, folder: Path) -> set[Path]:
     """Return the files below a folder that a file, or one of these, names in an import, also in functions."""
-    found: set[Path] = set()
+    imported: set[Path] = set()
     waiting = [path]
     while waiting:
         try:
@@ -125,10 +125,10 @@ def _imported_later(path: Path, folder: Path) -> set[Path]:
         names |= {f"{node.module}.{alias.name}" for node in froms for alias in node.names}
         for place in (folder.joinpath(*name.split(".")) for name in names):
             for file in (place.with_suffix(".py"), place / "__init__.py"):
-                if file.is_file() and file != path and file not in found:
-                    found.add(file)
+                if file.is_file() and file != path and file not in imported:
+                    imported.add(file)
                     waiting.append(file)
-    return found
+    return imported
 
 
 def _file_of(name: str) -> Path | None:
@@ -173,19 +173,19 @@ def reference_file(name: str) -> Path | None:
     return Path(match["path"]) if match else None
 
 
-def with_file(name: str, path: Path) -> str:
+def replace_reference_file(name: str, path: Path) -> str:
     """Return the reference with another path of its file."""
     if name.startswith(EXTERNAL):
         return f"{EXTERNAL}{path}"
     return f"{path}:{name.rpartition(':')[2]}"
 
 
-def absolute(name: str) -> str:
+def absolute_reference(name: str) -> str:
     """Return the reference with an absolute path."""
     if name.startswith(MASKS):
         return f"{MASKS}{Path(name.removeprefix(MASKS)).resolve()}"
     path = reference_file(name)
-    return name if path is None else with_file(name, path.resolve())
+    return name if path is None else replace_reference_file(name, path.resolve())
 
 
 def read_reference(name: str, *, given_as: str = "") -> MethodEntry:
@@ -210,7 +210,7 @@ def read_reference(name: str, *, given_as: str = "") -> MethodEntry:
         entry = _folder(Path(name.removeprefix(MASKS)))
     else:
         entry = _recipe(name)
-    return dataclasses.replace(entry, given_as=absolute(given_as or name))
+    return dataclasses.replace(entry, given_as=absolute_reference(given_as or name))
 
 
 def _folder(folder: Path) -> MethodEntry:

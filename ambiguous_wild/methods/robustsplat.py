@@ -42,7 +42,14 @@ from ambiguous_wild.splat.data import shrink, shrink_camera
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig
 from ambiguous_wild.splat.method_hooks import MethodHooks, Schedule
 from ambiguous_wild.splat.step import Step, TrainData
-from ambiguous_wild.vision.backends import BY_MACHINE, DINO, check_features, first_here, make_features, parse
+from ambiguous_wild.vision.backends import (
+    BY_MACHINE,
+    DINO,
+    check_features,
+    first_available,
+    make_features,
+    parse_spec,
+)
 from ambiguous_wild.vision.precompute import photo_features
 from ambiguous_wild.vision.protocols import Features
 
@@ -55,7 +62,7 @@ def features() -> str:
 
     Of the others EfficientNet-Lite0 alone is below 3DGS on no capture (docs/fidelity.md).
     """
-    return first_here(PUBLISHED, "efficientnet-lite0", "labhog")
+    return first_available(PUBLISHED, "efficientnet-lite0", "labhog")
 
 
 def _delayed_growth() -> DensityConfig:
@@ -151,12 +158,12 @@ class RobustSplatConfig:
     @property
     def local(self) -> bool:
         """Whether a cell of the features sees a small part of the photo: all but DINO's."""
-        return parse(self.features).name not in DINO
+        return parse_spec(self.features).name not in DINO
 
     @property
     def coarse_size(self) -> int | None:
         """Longer side in px of the coarse net's input; None: it follows the size of the picture."""
-        spec = parse(self.features)
+        spec = parse_spec(self.features)
         size = _SIZES.get(spec.name, 0) if spec.size is None else spec.size
         if spec.size == 0 or not size:
             return None
@@ -310,7 +317,7 @@ class RobustSplatMask(CountingMask, PausingMask):
         self.histogram = masking_common.update_histogram(self.histogram, e, config.decay)
         size = step.photo.shape[:2]
         lower, upper = (
-            resized(masking_common.bound(e, masking_common.percentile(self.histogram, share)), *size)
+            resized(masking_common.inlier_map(e, masking_common.percentile(self.histogram, share)), *size)
             for share in (config.lower, config.upper)
         )
         return lower, upper
@@ -405,7 +412,7 @@ def coarse_spec(config: RobustSplatConfig) -> str:
     """Return the features of the coarse stage: the same back end with an input of `coarse_size`."""
     if config.coarse_size is None:
         return config.features
-    spec = parse(config.features)
+    spec = parse_spec(config.features)
     head = f"{spec.name}@{config.coarse_size}"
     return head + "".join(f",{key}={value}" for key, value in spec.options.items())
 

@@ -19,10 +19,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core.config import State, check_limits
-from ambiguous_wild.methods.masking_common import EffectMask, enlarged
+from ambiguous_wild.methods.masking_common import EffectMask, upsampled
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import DensityConfig, DensityControl, Growth
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import (
+    AutogradEffect,
+    Leaf,
+    VisibleGaussians,
+    mlp,
+    mlp_leaves,
+)
 from ambiguous_wild.splat.effects.geometry import directions, harmonics, ray_directions
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -67,13 +73,13 @@ def build(options: SplatfactoWConfig) -> MethodHooks:
     """Return 3DGS with colours, background, masks, and growth by absolute gradients."""
     effect = SplatfactoColours(options)
     return MethodHooks(
-        mask=TrimmedLoss(effect), density=SplatfactoDensity, density_config=options.density,
+        mask=TrimmedLossMask(effect), density=SplatfactoDensity, density_config=options.density,
         schedule=Schedule(lr_opacity=0.03, resolution="coarse-to-fine"), weighting="images", antialias=True,
         effects=(effect,),
     )  # fmt: skip
 
 
-class SplatfactoColours(Learnt):
+class SplatfactoColours(AutogradEffect):
     """Draws SH = net([embedding; feature]), and picture + (1 - alpha) background(direction, embedding)."""
 
     name, unseen = "splatfacto-w", "mean"
@@ -111,7 +117,7 @@ class SplatfactoColours(Learnt):
             )
         }
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo = leaf["photo"].expand(len(visible.means), PHOTO)
         feature = visible.attributes["splatfacto_feature"]
         hidden = F.relu(mlp(torch.cat([photo, feature], dim=1), leaf, "net"))
@@ -130,7 +136,7 @@ class SplatfactoColours(Learnt):
         rest = mlp(hidden, leaf, "sky_rest").reshape(24, 3)
         basis = _up_to(harmonics(rays, 4), context.nominal // 1000)
         colours = basis @ torch.cat([mlp(hidden, leaf, "sky_dc"), rest])
-        return enlarged(colours.reshape(*small, 3), height, width)
+        return upsampled(colours.reshape(*small, 3), height, width)
 
     def tone(self, image: Tensor, alpha: Tensor, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         background = self.background(leaf, context) - self.behind  # instead of the scene's
@@ -143,7 +149,7 @@ def _up_to(basis: Tensor, degree: float) -> Tensor:
     return torch.cat([basis[:, :count], torch.zeros_like(basis[:, count:])], dim=1)
 
 
-class TrimmedLoss(EffectMask):
+class TrimmedLossMask(EffectMask):
     """Masks the largest residuals: the more, the larger the photo's loss among all so far."""
 
     effect: SplatfactoColours
@@ -164,13 +170,13 @@ class TrimmedLoss(EffectMask):
         self.low = torch.minimum(loss, torch.as_tensor(self.low).to(loss)) if self.rounds else loss
         number = backend_of(loss.device).number
         self.rounds, self.high, self.low = rounds, number(self.high), number(self.low)
-        return trimmed(error, self._share(loss))
+        return trimmed_keep(error, self._share(loss))
 
     def predict(self, step: Step) -> Tensor | None:
         if not self.rounds:
             return None
         error = self._error(step)
-        return trimmed(error, self._share(error.mean()))
+        return trimmed_keep(error, self._share(error.mean()))
 
     def _error(self, step: Step) -> Tensor:
         """Return the mean over channels of |photo - render|, [H, W], 0 in the part that is never masked."""
@@ -199,7 +205,7 @@ class TrimmedLoss(EffectMask):
         self.high, self.low, self.rounds = state["high"], state["low"], int(state["rounds"])
 
 
-def trimmed(error: Tensor, share: Tensor) -> Tensor:
+def trimmed_keep(error: Tensor, share: Tensor) -> Tensor:
     """Return 0 for this share of the largest errors, unless over 40 % of the 5x5 window is kept; [H, W]."""
     ordered = error.reshape(-1).sort().values
     at = ((1.0 - share) * (len(ordered) - 1)).reshape(1)  # rank of the quantile, between two values

@@ -25,9 +25,8 @@ from ambiguous_wild.methods.masking_common import (
     MaskNet,
     adam_of,
     annealed,
-    bound,
-    enlarged,
-    initialise,
+    init_uniform,
+    inlier_map,
     learner_state,
     load_learner,
     nearest,
@@ -35,6 +34,7 @@ from ambiguous_wild.methods.masking_common import (
     residual,
     sampled,
     update_histogram,
+    upsampled,
 )
 from ambiguous_wild.splat.density import NO_SIZE_PRUNING, DensityConfig, DensityControl
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -111,28 +111,28 @@ class PruningDensity(SpotLessDensity):
         return self.drop_rows(gaussians, optimiser, drop)
 
 
-class PlacedNet(MaskNet):
+class PositionalMaskNet(MaskNet):
     """The net of RobustSplat that also gets the position of the pixel."""
 
     def __init__(self, mean: Tensor, std: Tensor, hidden: int, seed: int) -> None:
         super().__init__(mean, std, hidden, seed)
         self.place = nn.Linear(4 * OCTAVES, hidden, bias=False, device=mean.device)
         limit = (len(mean) + 4 * OCTAVES) ** -0.5  # features and position form the input of one layer
-        initialise([(self.place, limit)], seed + 1)
+        init_uniform([(self.place, limit)], seed + 1)
         with torch.no_grad():
             for values in (self.first.weight, self.first.bias):
                 values *= limit * len(mean) ** 0.5
 
     def forward(self, features: Tensor, height: int, width: int) -> Tensor:
         """Return the map [height, width]; columns and rows are encoded separately, then summed."""
-        z = enlarged(self.first((features - self.mean) / self.std), height, width)
-        x, y = (placed(size, z) for size in (width, height))
+        z = upsampled(self.first((features - self.mean) / self.std), height, width)
+        x, y = (positional_encoding(size, z) for size in (width, height))
         across, down = self.place.weight[:, : 2 * OCTAVES], self.place.weight[:, 2 * OCTAVES :]
         z = z + (x @ across.T)[None, :, :] + (y @ down.T)[:, None, :]
         return torch.sigmoid(self.last(F.relu(z)).squeeze(2))
 
 
-def placed(size: int, like: Tensor) -> Tensor:
+def positional_encoding(size: int, like: Tensor) -> Tensor:
     """Return sin and cos of pi 2^k x, k = 0..19, at x from 0 to 1 along a side, [size, 40]."""
     at = torch.arange(size, device=like.device, dtype=torch.float64) / max(size - 1, 1)
     angles = torch.pi * torch.stack([2.0**k * at for k in range(OCTAVES)], dim=1)
@@ -195,7 +195,7 @@ class SpotLessMask(CountingMask):
         mean, std = cells.mean(0).float(), cells.std(0, correction=0).clamp(min=1e-6).float()
         if not self.config.features.startswith("labhog"):
             mean, std = torch.zeros_like(mean), torch.ones_like(std)
-        self.phi, self.net = phi, PlacedNet(mean, std, 16, data.seed)
+        self.phi, self.net = phi, PositionalMaskNet(mean, std, 16, data.seed)
         self.optimiser = adam_of(self.net, self.config.lr, data.device)
 
     def _clusters(self, phi: Tensor, photo: Tensor) -> np.ndarray:
@@ -238,7 +238,7 @@ class SpotLessMask(CountingMask):
 
     def _bound(self, error: Tensor, share: float, first: float) -> Tensor:
         """Return inliers [H, W] below the threshold of earlier steps; in the first step it is `first`."""
-        return bound(error, percentile(self.histogram, share) if self.seen else first)
+        return inlier_map(error, percentile(self.histogram, share) if self.seen else first)
 
     def _vote(self, inlier: Tensor, view: int) -> Tensor:
         labels = nearest(self.labels[view], *inlier.shape)

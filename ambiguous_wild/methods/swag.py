@@ -24,8 +24,14 @@ from ambiguous_wild.methods.masking_common import hashed_uniform
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.cpu.compile import kernel, parallel_kernel
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
-from ambiguous_wild.splat.effects.geometry import SceneNormaliser, in_picture, mean_of_seen, with_penalty
+from ambiguous_wild.splat.effects.autograd_effect import (
+    AutogradEffect,
+    Leaf,
+    VisibleGaussians,
+    mlp,
+    mlp_leaves,
+)
+from ambiguous_wild.splat.effects.geometry import SceneNormaliser, in_picture, mean_of_visible, with_penalty
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import TrainData, ViewContext
@@ -93,7 +99,7 @@ def hash_encoding(unit: Tensor, grid: Tensor, coarsest: int, finer: float) -> Te
     unit = unit.detach().to(grid).clamp(0.0, 1.0)
     cells = [float(int(coarsest * finer**level)) for level in range(len(grid))]
     if not backend_of(grid.device).kernels or grid.dtype != torch.float32:
-        return in_torch(unit, grid, cells)
+        return hash_encoding_torch(unit, grid, cells)
     code: Tensor = _Encoding.apply(unit, grid, torch.tensor(cells))
     return code
 
@@ -105,7 +111,7 @@ def prepare(device: torch.device) -> None:
         torch.autograd.grad(hash_encoding(grid.new_zeros(1, 3), grid, 1, 1.0).sum(), grid)
 
 
-def in_torch(unit: Tensor, grid: Tensor, cells: list[float]) -> Tensor:
+def hash_encoding_torch(unit: Tensor, grid: Tensor, cells: list[float]) -> Tensor:
     """Do as `hash_encoding` in torch, for accelerators, and to check the kernel."""
     levels, entries, _ = grid.shape
     scaled = torch.stack([unit * count for count in cells])  # [L, N, 3]
@@ -173,7 +179,7 @@ def build(options: SwagConfig) -> MethodHooks:
     return MethodHooks(effects=(GatedColours(options),), density_config=options.density)
 
 
-class GatedColours(Learnt):
+class GatedColours(AutogradEffect):
     """Draws colour + 2 sigmoid(net) - 1, and opacity (1 - z), where z = 1 switches a Gaussian off."""
 
     name = "swag"
@@ -213,7 +219,7 @@ class GatedColours(Learnt):
         photo = leaf["photo"].expand(len(places), PHOTO)
         return mlp(torch.cat([places, photo, colours], dim=1), leaf, "net")
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         outputs = self._net(self.encoded(visible.means, leaf), visible.base, leaf)
         return visible.base + 2.0 * torch.sigmoid(outputs[:, :3]) - 1.0
 
@@ -234,7 +240,7 @@ class GatedColours(Learnt):
         opacity = (torch.sigmoid(logits[seen]) * (1.0 - z)).clamp(MIN_OPACITY, 1.0 - 1e-6)
         opened = logits.clone()
         opened[seen] = torch.logit(opacity)
-        gate = mean_of_seen(z, means[seen], context.camera)
+        gate = mean_of_visible(z, means[seen], context.camera)
         return {"opacity_logits": with_penalty(opened, self.config.off * gate)}
 
     @torch.no_grad()

@@ -26,7 +26,7 @@ from ambiguous_wild.methods.masking_common import (
     adam_of,
     annealed,
     calibrated,
-    initialise,
+    init_uniform,
     learner_state,
     load_learner,
     resized,
@@ -70,7 +70,7 @@ class T3dgsConfig:
 def build(options: T3dgsConfig) -> MethodHooks:
     """Return 3DGS with masks and smooth depth."""
     rates = Schedule(lr_opacity=options.lr_opacity)
-    return MethodHooks(mask=Divergence(options), density_config=options.density, schedule=rates)
+    return MethodHooks(mask=DivergenceMask(options), density_config=options.density, schedule=rates)
 
 
 class TwoErrorHead(nn.Module):
@@ -84,7 +84,7 @@ class TwoErrorHead(nn.Module):
         self.last = nn.Conv2d(widths[3], 3, 1)
         self.norms = nn.ModuleList(nn.GroupNorm(1, width) for width in widths[1:])
         convs = (*self.convs, self.last)
-        initialise([(c, (c.in_channels * c.kernel_size[0] ** 2) ** -0.5) for c in convs], seed)
+        init_uniform([(c, (c.in_channels * c.kernel_size[0] ** 2) ** -0.5) for c in convs], seed)
 
     def forward(self, features: Tensor, height: int, width: int) -> Tensor:
         x = self._doubled(self.convs[0](features.permute(0, 3, 1, 2)), 0)
@@ -122,7 +122,7 @@ def _determinant(prediction: Tensor) -> Tensor:
     return (s1.square() * s2.square() * (1.0 - rho.square())).clamp(min=1e-6)
 
 
-class Divergence(CountingMask, PausingMask):
+class DivergenceMask(CountingMask, PausingMask):
     """Masks by the head, which learns from the photo alone; after an opacity reset by the last mask."""
 
     config: T3dgsConfig
@@ -187,7 +187,7 @@ class Divergence(CountingMask, PausingMask):
         with torch.enable_grad():
             depth = step.rendered.depth.detach().requires_grad_()
             alpha = step.rendered.alpha.detach().requires_grad_()
-            loss = self.config.variation * variation(inverse_depth(alpha, depth))
+            loss = self.config.variation * total_variation(inverse_depth(alpha, depth))
             pair = torch.autograd.grad(loss, (alpha, depth))
         return Cotangents(alpha=pair[0], depth=pair[1])
 
@@ -214,7 +214,7 @@ def inverse_depth(alpha: Tensor, depth: Tensor) -> Tensor:
     return torch.where(solid, alpha / depth.clamp(min=1e-6).where(solid, torch.ones_like(depth)), 0.0)
 
 
-def variation(values: Tensor) -> Tensor:
+def total_variation(values: Tensor) -> Tensor:
     """Return the total variation of a map [H, W], scaled to [0, 1]: mean |differences| along both axes."""
     low, high = values.amin(), values.amax()
     unit = (values - low) / (high - low).clamp(min=1e-9)

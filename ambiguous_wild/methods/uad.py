@@ -23,10 +23,10 @@ from ambiguous_wild.splat.step import Step
 
 def build(options: DensityConfig) -> MethodHooks:
     """Return 3DGS with this density control; graft it onto methods with masks: METHOD@density=uad."""
-    return MethodHooks(density=UncertaintyAware, density_config=options)
+    return MethodHooks(density=UncertaintyAwareDensity, density_config=options)
 
 
-class UncertaintyAware(DensityControl):
+class UncertaintyAwareDensity(DensityControl):
     """Grows by the ratio of `grad_sum`, a sum of weighted gradients, to `seen`, the sum of weights.
 
     A Gaussian whose weights sum to less than one pixel does not grow. `grow_grad` is the threshold of

@@ -38,7 +38,13 @@ from ambiguous_wild.methods.masking_common import (
     load_learner,
     resized,
 )
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import (
+    AutogradEffect,
+    Leaf,
+    VisibleGaussians,
+    mlp,
+    mlp_leaves,
+)
 from ambiguous_wild.splat.effects.base import rate_for_run_length
 from ambiguous_wild.splat.field import GaussianAttribute
 from ambiguous_wild.splat.gaussians import Gaussians
@@ -120,10 +126,10 @@ class WildGaussiansConfig:
 def build(options: WildGaussiansConfig) -> MethodHooks:
     """Return 3DGS with the masks, the appearance, or both."""
     effects = (WildAppearance(options),) if options.appearance else ()
-    return MethodHooks(mask=Uncertainty(options) if options.masks else MaskPolicy(), effects=effects)
+    return MethodHooks(mask=UncertaintyMask(options) if options.masks else MaskPolicy(), effects=effects)
 
 
-class WildAppearance(Learnt):
+class WildAppearance(AutogradEffect):
     """Draws (1 + m) colour + o, with (o, m) = scale MLP(colour, g of the Gaussian, a of the photo)."""
 
     name = "wildgaussians"
@@ -145,7 +151,7 @@ class WildAppearance(Learnt):
         start = noisy_fourier(gaussians.means, self.points, [self.seed, 0x36])
         return {"wild_embedding": GaussianAttribute(start, self.config.lr_gaussian)}
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         photo = leaf["photo"].expand(len(visible.base), PHOTO)
         inputs = torch.cat([visible.base, visible.attributes["wild_embedding"], photo], dim=1)
         offset, gain = (self.config.scale * mlp(inputs, leaf, "net")).split(3, dim=1)
@@ -202,7 +208,7 @@ def uncertainty_loss(sigma: Tensor, distance: Tensor, prior: float) -> Tensor:
     return (distance * 0.5 / sigma.square()).mean() + prior * sigma.log().mean()
 
 
-class Uncertainty(CountingMask, PausingMask):
+class UncertaintyMask(CountingMask, PausingMask):
     """Keeps pixels with 1 / (2 sigma^2) > 1; the head learns in every step, but not after opacity resets."""
 
     config: WildGaussiansConfig

@@ -155,9 +155,9 @@ class MeasuredScene:
 
 def feature_family(spec: str) -> str:
     """Return the name of a back end without size and options: ``labhog``, ``dinov2-small``."""
-    from ambiguous_wild.vision.backends import parse
+    from ambiguous_wild.vision.backends import parse_spec
 
-    return parse(spec).name
+    return parse_spec(spec).name
 
 
 def weight_free(spec: str) -> bool:

@@ -24,7 +24,7 @@ from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.labels import shown_names
 from ambiguous_wild.harness.measures import measure
 from ambiguous_wild.harness.result_file import RESULT, encoded
-from ambiguous_wild.harness.trained_models import TrainedModel, find_models, open_scene
+from ambiguous_wild.harness.trained_models import TrainedModel, find_run_models, open_scene
 from ambiguous_wild.io.files import (
     atomic_dir,
     check_output,
@@ -404,7 +404,7 @@ def write_model_pages(
     Raises:
         AwError: no run with a model below `runs`, or a scene is not where its run says.
     """
-    trained, notes = find_models(runs)
+    trained, notes = find_run_models(runs)
     for note in notes:
         say(note)
     by_hash = {sha256_file(t.run / RESULT): t for t in trained}

@@ -253,7 +253,7 @@ def speed_here(cost_runs: CostRuns) -> float:
 
     from ambiguous_wild.harness.timing import slowness
     from ambiguous_wild.splat.calibration import KERNELS, prepare_cpu
-    from ambiguous_wild.splat.readiness import choose
+    from ambiguous_wild.splat.readiness import choose_device
 
     kernels = {run.timing.kernel for run in cost_runs.runs if not run.error}
     device = next((device for device, size in KERNELS.items() if size.name in kernels), "cpu")
@@ -261,5 +261,5 @@ def speed_here(cost_runs: CostRuns) -> float:
         prepare_cpu(None)
         torch.set_num_threads(1)
     else:
-        choose("cuda", lambda text: None)
+        choose_device("cuda", lambda text: None)
     return 1.0 / slowness(device)

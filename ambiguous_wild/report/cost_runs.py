@@ -27,10 +27,10 @@ from ambiguous_wild.harness.store import (
     ReadConfig,
     check_names,
     checked_result,
+    config_section,
     find_runs,
     metric_functions,
     read_config,
-    section,
 )
 from ambiguous_wild.harness.timing import Timing, in_reference_seconds, timing_of
 from ambiguous_wild.io.files import own_json
@@ -255,8 +255,8 @@ def why_unranked(runs: Iterable[CostRun]) -> str:
 
 def _run(folder: Path, result: RunResult) -> CostRun:
     config = read_config(folder)
-    train, scene = section(config, "train"), section(config, "scene")
-    cost, record = result["cost"], section(dict(result["cost"]), "timing")
+    train, scene = config_section(config, "train"), config_section(config, "scene")
+    cost, record = result["cost"], config_section(dict(result["cost"]), "timing")
     images = {row["name"]: _number(row.get("psnr")) for row in result["per_image"]}
     psnr, train_s = stats.mean(list(images.values())), _number(cost.get("train_s"))
     effects = config.get("effects") or result["facts"].get("effects") or []
@@ -266,7 +266,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         "train": {k: v for k, v in train.items() if k not in (*BOOKKEEPING, *SETTINGS)},
         "device": config.get("device", cost.get("device")),
         "protocol": config.get("protocol", "full"),
-        "start": section(config, "start").get("sha256"),
+        "start": config_section(config, "start").get("sha256"),
         "code": [config.get("source"), result["version"], result.get("code_hash")],
         "images": sorted(images),
     }

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ambiguous_wild.core import Camera, Scene, View
-from ambiguous_wild.harness.trained_models import find_models
+from ambiguous_wild.harness.trained_models import find_run_models
 from ambiguous_wild.io.images import read_png_rgb
 from ambiguous_wild.io.lens import Lens
 from ambiguous_wild.viewing.model import Renderer
@@ -35,7 +35,7 @@ class Inpainting:
         Raises:
             AwError: the run has no model.
         """
-        (trained,), _ = find_models([run])
+        (trained,), _ = find_run_models([run])
         self._renderer = Renderer(trained.model.read(), trained.model.render_settings)
         self._keeps = keeps
         self._unseen = self._unseen_shares(scene.train)

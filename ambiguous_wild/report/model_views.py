@@ -18,11 +18,11 @@ from ambiguous_wild.harness.callbacks import Callbacks, outcome_line, run_name
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.evaluate import keep_maps
 from ambiguous_wild.harness.trained_models import (
-    find_models,
+    find_run_models,
     open_scene,
     page_title,
-    read_files,
     read_models,
+    read_splat_models,
     training_model,
 )
 from ambiguous_wild.io.files import check_output, refuse_files_there, write_text
@@ -99,11 +99,11 @@ def export_runs(
         AwError: no run with a model, a file that is none, a folder that cannot be written, or files of these
             names in `output`.
     """
-    files, notes = read_files(paths)
+    files, notes = read_splat_models(paths)
     if up is not None and files and scene_folder is None:
         raise AwError(f"{files[0].ply}: --up needs the cameras of its scene: name its folder with --scene")
     runs = [path for path in paths if not path.is_file()]
-    trained, more = find_models(runs) if runs else ([], [])
+    trained, more = find_run_models(runs) if runs else ([], [])
     for note in (*notes, *more):
         say(note)
     models = [*(t.model for t in trained), *files]
@@ -294,7 +294,7 @@ class GrowingPage:
         self._next_label = label
         self._ended: list[ViewedModel] = []
         with suppress(AwError):  # no run has ended yet
-            self._ended = [t.model for t in find_models([self.runs])[0] if t.model.label != label]
+            self._ended = [t.model for t in find_run_models([self.runs])[0] if t.model.label != label]
 
     def tick(self, trainer: Trainer) -> bool:
         """Write the page if one is due, after an iteration with the clock stopped; return whether it was."""

@@ -16,7 +16,7 @@ from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.harness.labels import IN_FOLDER
 from ambiguous_wild.harness.measures import Measure, measure
 from ambiguous_wild.harness.result_file import NOT_BEGUN, Options
-from ambiguous_wild.harness.store import Runs, read_config, section
+from ambiguous_wild.harness.store import Runs, config_section, read_config
 from ambiguous_wild.methods.graft import members
 from ambiguous_wild.methods.registry import all_methods, knows_truth
 from ambiguous_wild.report.plain_formats import UNEQUAL, UNFITTED
@@ -190,12 +190,12 @@ def _about(runs: Runs, methods: Sequence[str]) -> list[str]:
 def _options_of(folder: Path, name: str) -> Options:
     """Return the options of a method in a run, by dotted names; a graft has them below its places."""
     config = read_config(folder)
-    options = section(config, "options")
+    options = config_section(config, "options")
     written = str(config.get("method"))
     if "=" in written:
         host, _, rest = written.rpartition("@")
         places = {"host": host} | dict(pair.split("=", 1) for pair in rest.split(",") if "=" in pair)
-        options = next((section(options, p) for p, member in places.items() if member == name), {})
+        options = next((config_section(options, p) for p, member in places.items() if member == name), {})
     elif "host" in options:  # a graft that is the variant of an ablation: the method is its donor
         options = next((value for place, value in options.items() if place != "host"), {})
     return flatten(options) if isinstance(options, dict) else {}

@@ -16,10 +16,10 @@ from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.core.names import plain
-from ambiguous_wild.harness.cell import code_hash, commit
+from ambiguous_wild.harness.cell import code_hash, package_commit
 from ambiguous_wild.harness.command_lines import length_text
 from ambiguous_wild.harness.result_file import Environment, RunConfig, RunResult
-from ambiguous_wild.harness.store import checked_result, effects_of, find_runs, read_config, section
+from ambiguous_wild.harness.store import checked_result, config_section, effects_of, find_runs, read_config
 from ambiguous_wild.report.board import hidden_in
 from ambiguous_wild.report.board_reproduce import Scenes, command_words, preparation
 from ambiguous_wild.report.plain_formats import WIDTH, markdown_text
@@ -137,7 +137,7 @@ def _seeds(runs: Iterable[_Run]) -> list[str]:
 
 
 def _length(run: _Run) -> str:
-    train = section(dict(run.config), "train") if run.config else {}
+    train = config_section(dict(run.config), "train") if run.config else {}
     length = run.result["facts"].get("length")
     return str(
         length or length_text(train.get("iterations"), train.get("budget_s")) or "an unrecorded length"
@@ -155,7 +155,7 @@ def _code(runs: Sequence[_Run]) -> list[str]:
 def _version(run: _Run) -> str:
     code = str(run.result.get("code_hash", ""))
     # a result of an earlier version names no commit; if its code is the present one, so is its commit
-    of = run.environment.get("commit") or (commit() if code and code == code_hash() else "")
+    of = run.environment.get("commit") or (package_commit() if code and code == code_hash() else "")
     parts = [f"commit {of}"] if of else []
     parts += [f"code {code[:HASH]}"] if code else []
     return run.result["version"] + (f" ({', '.join(parts)})" if parts else "")
@@ -205,7 +205,7 @@ def _repeats(runs: Sequence[_Run]) -> str:
 
 def _why_not(run: _Run) -> str:
     """Return why a run does not repeat bit for bit, of "they ..."; empty if it does."""
-    train = section(dict(run.config), "train") if run.config else {}
+    train = config_section(dict(run.config), "train") if run.config else {}
     if not train:
         return "are of another program"
     if not str(run.result["cost"].get("device", "")).startswith("cpu"):

@@ -25,7 +25,7 @@ from ambiguous_wild.harness.result_file import (
     read_result,
     write_result,
 )
-from ambiguous_wild.harness.store import find_runs, lacks, read_config
+from ambiguous_wild.harness.store import find_runs, lacks_metric, read_config
 from ambiguous_wild.harness.trained_models import Opened, open_scene
 from ambiguous_wild.io.files import folder_lock
 from ambiguous_wild.io.images import read_png_rgb
@@ -82,7 +82,7 @@ def _rescore(run: Path, folder: Path | None, opened: Opened) -> Rescored:
         renders = renders_of(run, result)
         if lacking := shortlist(path.name for path in renders.values() if not path.is_file()):
             raise AwError(f"{run} lacks its renders {lacking}: restore them, or run it again")
-        wanted = [metric for key, metric in metrics().items() if lacks(result, key)]
+        wanted = [metric for key, metric in metrics().items() if lacks_metric(result, key)]
         for row in result["per_image"]:
             for metric in wanted:
                 row.pop(metric.key, None)  # type: ignore[misc]  # from another version of its file

@@ -132,7 +132,7 @@ def prepare_simulated(
     Raises:
         AwError: as `make_captures`, or a scene cannot be built or was built from something else.
     """
-    from ambiguous_wild.builder.pipeline import OtherSceneThere, build_scene
+    from ambiguous_wild.builder.pipeline import OutputExists, build_scene
 
     make_captures(suite, root, progress=progress, say=say)
     folders = {name: root / (EXACT_SCENES if exact_poses else SCENES) / name for name in suite.scenes}
@@ -143,7 +143,7 @@ def prepare_simulated(
         settings = BuildSettings(factor=suite.factor, license=suite.license, mapper=mapper)
         try:
             build_scene(root / CAPTURES / name, scene, settings, progress=progress)
-        except OtherSceneThere as error:
+        except OutputExists as error:
             raise AwError(
                 f"{scene} is damaged, or was built from another capture, by other settings or versions: "
                 "remove it, and the same command builds it again"

@@ -27,7 +27,7 @@ from ambiguous_wild.harness.effects_plan import (
     SAMPLING,
     Evidence,
     has_tracks,
-    measure,
+    measure_evidence,
 )
 from ambiguous_wild.io.images import load_image_float
 from ambiguous_wild.io.motion_points import read_motion_points
@@ -37,8 +37,8 @@ from ambiguous_wild.simulate.spec import (
     FULL_FRAME_DIAGONAL_MM,
     CaptureSpec,
     Defocus,
-    Designed,
     Effects,
+    ExpectedAmbiguity,
     ExposureDrift,
     IsoNoise,
     TimeOfDay,
@@ -119,7 +119,7 @@ def measure_likeness(scene: Scene) -> Likeness:
         factor=int(scene.info.get("loaded_factor", 1)),
         focal=float(np.median([0.5 * (c.fx + c.fy) / math.hypot(c.width, c.height) for c in cameras])),
         arc_deg=arc_of(np.array([camera.cam_from_world[2, :3] for camera in cameras])),
-        evidence=measure(scene, (load_image_float(view.image_path) for view in scene.train)),
+        evidence=measure_evidence(scene, (load_image_float(view.image_path) for view in scene.train)),
         noise=noise * float(np.median(smaller)) if noise >= NOISE else 0.0,
         soft=float(np.mean(np.array(sharp) < BLUR_RATIO * np.median(sharp))),
         moving=(float(low), float(np.mean(shares)) if shares else math.nan, float(high)),
@@ -167,7 +167,7 @@ def spec_like(of: Likeness, width: int | None = None, seed: int = 0, views: int 
         arc_deg=round(arc_deg),
         zoom=zoom,
         effects=_effects(of, factor, seed, views or seen.photos),
-        designed=Designed(),
+        designed=ExpectedAmbiguity(),
     )
     spec = resized(check_spec(spec), views)
     return FittedSpec(spec, factor, tuple(_lines(of, spec, factor)))

@@ -5,7 +5,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ambiguous_wild.simulate.textures import Colour, laid, octaves, scattered, step, tint, uniform
+from ambiguous_wild.simulate.textures import (
+    Colour,
+    blended_layers,
+    mirrored_brightness,
+    octaves,
+    step,
+    tint,
+    uniform,
+)
 
 PAINT: Colour = (0.52, 0.47, 0.38)  # colour of the room's walls
 
@@ -21,7 +29,7 @@ def painted_wall(
     """Painted plaster: nearly plain, with faint trowel marks, stains and a few hairline cracks."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     wall = tint(rng, h, w, px_per_m, colour, 0.12)
-    wall = wall * scattered("gravel", rng, h, w, px_per_m, 3.0) ** 0.12
+    wall = wall * blended_layers("gravel", rng, h, w, px_per_m, 3.0) ** 0.12
     ridges = np.abs(octaves(rng, h, w, 0.9 * px_per_m, 6) - 0.5)
     wall = wall * (1 - 0.35 * (1 - step(0.002, 0.008, ridges)) * step(0.5, 0.6, octaves(rng, h, w, px_per_m)))
     stains = step(0.62, 0.8, octaves(rng, h, w, 0.7 * px_per_m, 5))
@@ -39,7 +47,7 @@ def enamel(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: 
 def asphalt(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
     """Patched asphalt, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    grain = scattered("gravel", rng, h, w, px_per_m, 1.3) ** 0.8
+    grain = blended_layers("gravel", rng, h, w, px_per_m, 1.3) ** 0.8
     road = grain * tint(rng, h, w, px_per_m, (0.10, 0.10, 0.105), 0.4)
     patch = step(0.57, 0.585, octaves(rng, h, w, 1.3 * px_per_m, 3))
     road = road * (1 - 0.45 * patch)
@@ -53,7 +61,7 @@ def yard_ground(rng: np.random.Generator, width_m: float, height_m: float, px_pe
     h, w = road.shape[:2]
     x = ((np.arange(w) + 0.5) / px_per_m - width_m / 2)[None]
     y = ((np.arange(h) + 0.5) / px_per_m - height_m / 2)[:, None]
-    paving = laid("brick", h, w, px_per_m, 2.4, 3.0, rng.random(2))
+    paving = mirrored_brightness("brick", h, w, px_per_m, 2.4, 3.0, rng.random(2))
     paving = paving * tint(rng, h, w, px_per_m, (0.3, 0.28, 0.25), 0.4)
     edge = np.maximum(np.abs(x) - (width_m / 2 - 2.6), np.abs(y) - (height_m / 2 - 2.4))
     ragged = 0.12 * (octaves(rng, h, w, 0.3 * px_per_m, 3) - 0.5)
@@ -66,7 +74,7 @@ def yard_ground(rng: np.random.Generator, width_m: float, height_m: float, px_pe
         white = (line * (0.4 + 0.6 * (worn > 0.45)))[..., None]
         ground = ground + (0.62 - ground) * 0.85 * white
     weeds = step(0.6, 0.68, octaves(rng, h, w, 0.5 * px_per_m, 6) + 0.12 * np.exp(-np.abs(edge) / 0.2))
-    grass = scattered("grass", rng, h, w, px_per_m, 1.2) * np.array([0.1, 0.15, 0.045])
+    grass = blended_layers("grass", rng, h, w, px_per_m, 1.2) * np.array([0.1, 0.15, 0.045])
     return np.asarray(ground + 0.9 * (grass - ground) * weeds, dtype=np.float32)
 
 
@@ -122,9 +130,9 @@ def facade(
     Row 0 is the foot. [H, W, 3] linear light.
     """
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    wall = tint(rng, h, w, px_per_m, colour, 0.35) * scattered("gravel", rng, h, w, px_per_m, 4.0) ** 0.3
+    wall = tint(rng, h, w, px_per_m, colour, 0.35) * blended_layers("gravel", rng, h, w, px_per_m, 4.0) ** 0.3
     fallen = step(0.62, 0.635, octaves(rng, h, w, 1.2 * px_per_m, 6))
-    courses = laid("brick", h, w, px_per_m, 1.9, 90.0, rng.random(2)) ** 1.2
+    courses = mirrored_brightness("brick", h, w, px_per_m, 1.9, 90.0, rng.random(2)) ** 1.2
     brick = courses * tint(rng, h, w, px_per_m, (0.3, 0.14, 0.085), 0.5)
     foot = step(0.0, 0.02, 0.8 - np.arange(h)[:, None] / px_per_m)
     wall = wall + (brick - wall) * np.maximum(fallen, foot)

@@ -38,7 +38,7 @@ from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.files import atomic_dir, refuse_foreign_files, sha256_file, write_json
 from ambiguous_wild.io.progress_bar import Progress
 from ambiguous_wild.simulate.courtyard import courtyard
-from ambiguous_wild.simulate.distractors import lay_out
+from ambiguous_wild.simulate.distractors import place_distractors
 from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.photo_render import (
     PlannedPhoto,
@@ -47,7 +47,7 @@ from ambiguous_wild.simulate.photo_render import (
     depth_m,
     finish_photo,
     prepare_photo,
-    things_of,
+    static_object_names,
     trace_photo,
 )
 from ambiguous_wild.simulate.room import room
@@ -182,12 +182,12 @@ def build_world(rng: np.random.Generator, detail_px_per_m: float, samples: int, 
     return _PLACES[what.place](rng, detail_px_per_m, samples, what)
 
 
-def plan(spec: CaptureSpec, seed: int) -> tuple[World, list[PlannedPhoto]]:
+def plan_capture(spec: CaptureSpec, seed: int) -> tuple[World, list[PlannedPhoto]]:
     """Plan the world and every photo to render; world, walk and layout have independent random streams."""
     paint, walk, layout = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
     world = build_world(paint, spec.detail_px_per_m, spec.samples, spec.world)
     train, test = plan_cameras(spec, world, walk)
-    layouts = lay_out(spec, train, world, layout)
+    layouts = place_distractors(spec, train, world, layout)
     first_test = 100 * (spec.train_views // 100 + 1) + 1
     planned = [
         PlannedPhoto(f"IMG_{k + 1:04d}.jpg", "train", c, p) for k, (c, p) in enumerate(zip(train, layouts))
@@ -221,7 +221,7 @@ def simulate(
     earlier = _earlier(out, identity, overwrite)
     if earlier is not None:
         return {**earlier, "reused": True}
-    world, planned = plan(spec, seed)
+    world, planned = plan_capture(spec, seed)
     with atomic_dir(out) as folder:
         shadow = ["truth/shadow"] if spec.has_shadows else []
         optional = [*shadow, *(["truth/depth"] if depth else [])]
@@ -238,7 +238,7 @@ def simulate(
         photos = _render(spec, world, planned, seed, folder, depth, progress)
         write_json(folder / "truth" / "cameras.json", {s.name: _camera_json(spec, s.camera) for s in planned})
         files = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
-        facts = _facts(spec, seed, identity, photos, things_of(world))
+        facts = _facts(spec, seed, identity, photos, static_object_names(world))
         facts["files"] = {name: sha256_file(folder / name) for name in files}
         write_json(folder / "truth" / "capture.json", facts)
     return {**facts, "reused": False}

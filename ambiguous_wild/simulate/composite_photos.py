@@ -31,20 +31,20 @@ from ambiguous_wild.simulate.cutouts import (
     TRUTH_COVER,
     Cutout,
     CutoutPlacement,
+    blend_layer,
     blobs,
-    composed,
     cut_patch,
-    layer,
+    draw_layer,
+    layer_mask,
     read_cutouts,
-    truth,
 )
-from ambiguous_wild.simulate.fixed_things import fixed_layer, laid_over
+from ambiguous_wild.simulate.fixed_things import alpha_over, overlay_layer
 from ambiguous_wild.simulate.placement import (
     LONGEST,
     PREVIEW_PX,
     CompositeConfig,
-    bisected,
-    covered,
+    bisect_scale,
+    covered_share,
     longest_side,
     natural_heights,
 )
@@ -126,7 +126,7 @@ def composite_photos(
                 continue
             over, pieces = np.zeros((*clean.shape[:2], 4), np.float32), list[Facts]()
             if tracks:
-                now, middles, heights = _under_way(tracks, number, clean.shape)
+                now, middles, heights = _active_tracks(tracks, number, clean.shape)
                 over, pieces = _pasted([tracks[k].piece for k in now], middles, heights, clean.shape)
                 pieces = [{**piece, "track": k} for piece, k in zip(pieces, now, strict=True)]
             elif path in chosen:
@@ -139,7 +139,7 @@ def composite_photos(
                 over, pieces = _layer(drawn, clean.shape, cover, rng)
             if config.fixed is not None:
                 over = _with_fixed(config.fixed, clean, over, number, config.seed)
-            changed, mask = composed(clean, over), truth(over)
+            changed, mask = blend_layer(clean, over), layer_mask(over)
             _write_jpeg(folder / ("test" if test else "train") / name, changed, exif)
             write_png(folder / "truth" / "clean" / own, clean)
             write_png(folder / "truth" / "distractor" / own, mask)
@@ -174,10 +174,10 @@ def _with_fixed(
     seed: int,
 ) -> np.ndarray:
     """Lay what is fixed to the camera over the other distractors."""
-    light = srgb_to_linear(composed(photo, moving).astype(np.float32) / 255)
-    top = fixed_layer(thing, light, number, seed)
+    light = srgb_to_linear(blend_layer(photo, moving).astype(np.float32) / 255)
+    top = overlay_layer(thing, light, number, seed)
     top[top[..., 3] < TRUTH_COVER] = 0  # as of the others
-    return laid_over(top, moving)
+    return alpha_over(top, moving)
 
 
 def _base(root: Path) -> Path:
@@ -274,7 +274,9 @@ def _layer(
     natural, small = natural_heights(cutouts, rng), [c.reduced(PREVIEW_PX) for c in cutouts]
     preview = _camera(width, height, PREVIEW_PX / max(width, height))
     high = LONGEST * max(1.0, width / height) / longest_side(natural, cutouts)
-    scale = bisected(lambda scale: covered(small, natural * scale, placements, preview), high, cover)
+    scale = bisect_scale(
+        lambda scale: covered_share(small, natural * scale, placements, preview), high, cover
+    )
     return _pasted(drawn, middles, natural * scale, size)
 
 
@@ -292,7 +294,7 @@ def _pasted(
 ) -> tuple[np.ndarray, list[Facts]]:
     """Draw the pieces at their places as a layer, with their records."""
     camera = _camera(size[1], size[0], 1.0)
-    over = layer([c for c, _, _ in drawn], list(heights), _placements(middles, size), camera)
+    over = draw_layer([c for c, _, _ in drawn], list(heights), _placements(middles, size), camera)
     over[over[..., 3] < TRUTH_COVER] = 0  # pixels that the mask leaves out keep their bytes
     pieces: list[Facts] = [
         {
@@ -368,9 +370,9 @@ def _tracks(
         shares = []
         scaled = _scaled(small, scale, size)
         for number in train:
-            now, middles, heights = _under_way(scaled, number, size)
+            now, middles, heights = _active_tracks(scaled, number, size)
             shown, placements = [small[k].piece[0] for k in now], _placements(middles, size)
-            shares.append(covered(shown, heights, placements, preview))
+            shares.append(covered_share(shown, heights, placements, preview))
         return float(np.mean(shares))
 
     high = LONGEST * max(1.0, size[1] / size[0]) / min(min(t.height) for t in tracks)
@@ -379,7 +381,7 @@ def _tracks(
             f"--coverage {config.coverage:g} is more than --path can cover ({share(high):.2f} with the "
             "largest pieces); lower it or raise --presence"
         )
-    return _scaled(tracks, bisected(share, high, config.coverage), size)
+    return _scaled(tracks, bisect_scale(share, high, config.coverage), size)
 
 
 def _scaled(tracks: Sequence[_Track], scale: float, size: tuple[int, ...]) -> list[_Track]:
@@ -392,7 +394,7 @@ def _scaled(tracks: Sequence[_Track], scale: float, size: tuple[int, ...]) -> li
     ]
 
 
-def _under_way(
+def _active_tracks(
     tracks: Sequence[_Track], number: int, size: tuple[int, ...]
 ) -> tuple[list[int], np.ndarray, np.ndarray]:
     """Return indices [K] of the tracks in a photo, middles [K, 2] over its sides, and heights [K]."""

@@ -28,19 +28,19 @@ from ambiguous_wild.io.scene_folder import SCENE_SCHEMA, load_scene, read_scene_
 from ambiguous_wild.simulate.cutouts import (
     Cutout,
     CutoutPlacement,
+    blend_layer,
     blobs,
-    composed,
-    layer,
+    draw_layer,
+    layer_mask,
     read_cutouts,
     resized,
-    truth,
 )
 from ambiguous_wild.simulate.placement import (
     CompositeConfig,
     cut_patches,
     local_colours,
     natural_heights,
-    place,
+    place_cutouts,
     scene_spread,
     solve_heights,
     visible_points,
@@ -147,7 +147,7 @@ def _plan(
     else:
         shown, chosen = shapes, {}
     natural = natural_heights(shown, place_rng)
-    placements = place(sites, scene_spread(scene), config, place_rng, len(shown), **chosen)  # type: ignore[arg-type]
+    placements = place_cutouts(sites, scene_spread(scene), config, place_rng, len(shown), **chosen)  # type: ignore[arg-type]
     heights = solve_heights(shown, natural, sites, placements, config)
     return _PastePlan(shown, heights, placements)
 
@@ -173,17 +173,17 @@ def _write_photos(
         for view in progress(scene.train):
             sizes = [image_size(pictures[view.name]) for _, pictures in kinds]
             full = view.camera.resized(*max(sizes))
-            over = layer(plan.cutouts, list(plan.heights), placements[view.name], full, config.shadow)
+            over = draw_layer(plan.cutouts, list(plan.heights), placements[view.name], full, config.shadow)
             jobs = []
             for (_, pictures), (width, height) in zip(kinds, sizes, strict=True):
                 path = pictures[view.name]
                 photo = read_png_rgb(path)
-                changed = composed(photo, resized(over, width, height))
+                changed = blend_layer(photo, resized(over, width, height))
                 # Changed photos become PNG, to avoid a second JPEG compression.
                 out = (folder / path.relative_to(scene.root)).with_suffix(".png")
                 jobs.append(writers.submit(write_png, out, changed))
                 if path == view.image_path:
-                    mask = truth(resized(over, width, height))
+                    mask = layer_mask(resized(over, width, height))
                     own = Path(view.name).with_suffix(".png")
                     for part, pixels in (("clean", photo), ("distractor", mask)):
                         jobs.append(writers.submit(write_png, folder / "truth" / part / own, pixels))

@@ -6,14 +6,14 @@ import numpy as np
 
 from ambiguous_wild.simulate import textures as tx
 from ambiguous_wild.simulate.kernels import CYLINDER, ELLIPSOID
-from ambiguous_wild.simulate.shapes import Shape, between, figure, placed, vector
+from ambiguous_wild.simulate.shapes import Shape, capsule_between, figure, transformed, vector
 from ambiguous_wild.simulate.spec import PLANS, WorldSpec
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
     World,
     baked_sheets,
     box,
-    parts_of,
+    object_shapes,
     poster,
     sunlight,
     surface,
@@ -57,7 +57,9 @@ def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float,
     circles: list[tuple[float, float, float]] = []
     for x, y in ((-3.1, 2.6), (3.0, 2.3), (-4.5, -0.6)):
         x, y = x + rng.uniform(-0.25, 0.25), y + rng.uniform(-0.25, 0.25)
-        shapes.append(between((x, y, 0), (x, y, 0.55), 0.36, "clay", CYLINDER, offset=tuple(rng.random(2))))
+        shapes.append(
+            capsule_between((x, y, 0), (x, y, 0.55), 0.36, "clay", CYLINDER, offset=tuple(rng.random(2)))
+        )
         for _ in range(5):
             at = np.array([x, y, 0.85]) + rng.uniform(-0.24, 0.24, 3) * (1, 1, 0.9)
             size = rng.uniform(0.22, 0.36, 3)
@@ -72,7 +74,7 @@ def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float,
             top = (x + 0.04, y, 2 * half + 0.2)
             shapes.append(box(top, (0.26, 0.2, 0.2), yaw + 25, "timber", offset=tuple(rng.random(2))))
     bx, by, yaw = rng.uniform(-2.4, -2.0), rng.uniform(0.5, 0.9), rng.uniform(-30, -10)
-    shapes += placed(parts_of("courtyard bench"), (bx, by, 0), yaw)
+    shapes += transformed(object_shapes("courtyard bench"), (bx, by, 0), yaw)
     circles.append((bx, by, 0.85))
     sx, sy = rng.uniform(1.9, 2.2), rng.uniform(0.5, 0.8)
     shapes += [
@@ -106,6 +108,6 @@ def courtyard(rng: np.random.Generator, detail_px_per_m: float, samples: int, wh
     }
     shapes = [*_walls(rng), *furniture]
     if what.statue:
-        shapes += placed(parts_of("courtyard plinth"), (statue[0], statue[1], 0), yaw)
-        shapes += placed(figure("stone", "stone", 0.07, 0.8), statue, yaw, thing="statue")
+        shapes += transformed(object_shapes("courtyard plinth"), (statue[0], statue[1], 0), yaw)
+        shapes += transformed(figure("stone", "stone", 0.07, 0.8), statue, yaw, thing="statue")
     return world_of(PLAN, what, shapes, circles, textures, d, sunlight(rng, samples), statue)

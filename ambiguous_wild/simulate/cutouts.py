@@ -170,7 +170,7 @@ class CutoutPlacement:
     standing: bool
 
 
-def layer(
+def draw_layer(
     cutouts: Sequence[Cutout],
     heights: Sequence[float],
     placements: Sequence[CutoutPlacement],
@@ -237,7 +237,7 @@ def resized(over: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(over, (width, height), interpolation=cv2.INTER_AREA)
 
 
-def composed(
+def blend_layer(
     photo: np.ndarray,  # [H, W, 3] uint8, sRGB
     over: np.ndarray,  # [H, W, 4] float32
 ) -> np.ndarray:  # [H, W, 3] uint8, sRGB
@@ -250,6 +250,6 @@ def composed(
     return out
 
 
-def truth(over: np.ndarray) -> np.ndarray:
+def layer_mask(over: np.ndarray) -> np.ndarray:
     """Return 255 where the layer covers at least a quarter of a pixel, else 0: [H, W] uint8."""
     return np.where(over[..., 3] >= TRUTH_COVER, 255, 0).astype(np.uint8)

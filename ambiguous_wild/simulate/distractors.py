@@ -13,10 +13,10 @@ import numpy as np
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate.image_effects import specular
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID, INSTANTS
-from ambiguous_wild.simulate.shapes import Shape, barrier, figure, placed, shape_table
+from ambiguous_wild.simulate.shapes import Shape, barrier, figure, shape_table, transformed
 from ambiguous_wild.simulate.spec import STATUES, CaptureSpec, Distractor, GroundPlan
 from ambiguous_wild.simulate.tracer import ShapeTable, first_hits
-from ambiguous_wild.simulate.world import World, car, parts_of, placard, statue
+from ambiguous_wild.simulate.world import World, car, object_shapes, placard, statue
 
 _TRIES = 80  # layouts drawn for a photo, of which the best is taken
 _SAME_PLACE_M = 0.6  # closer than this is the same place
@@ -41,7 +41,7 @@ class DistractorPose:
     pose: float  # stride, arm and bend of a figure, 0 to 1
 
 
-def shapes_of(distractor: Distractor, placement: DistractorPose, plan: GroundPlan) -> list[Shape]:
+def distractor_shapes(distractor: Distractor, placement: DistractorPose, plan: GroundPlan) -> list[Shape]:
     """Make the distractor's shapes in the world, owned by ``placement.which + 1``.
 
     One that moves during the exposure is there at each instant, at another place.
@@ -50,13 +50,13 @@ def shapes_of(distractor: Distractor, placement: DistractorPose, plan: GroundPla
     parts = [_tinted(s, distractor) for s in _parts(distractor, placement.pose, plan)]
     owner = placement.which + 1
     if not distractor.blur_m:
-        return placed(parts, at, placement.yaw_deg, distractor.size, owner=owner)
+        return transformed(parts, at, placement.yaw_deg, distractor.size, owner=owner)
     facing = np.deg2rad(placement.yaw_deg + _FACES_DEG.get(distractor.kind, -90.0))
     shapes = []
     for instant in range(INSTANTS):
         way = distractor.blur_m * ((instant + 0.5) / INSTANTS - 0.5)
         there = (at[0] + way * float(np.cos(facing)), at[1] + way * float(np.sin(facing)), at[2])
-        shapes += placed(parts, there, placement.yaw_deg, distractor.size, owner=owner, instant=instant)
+        shapes += transformed(parts, there, placement.yaw_deg, distractor.size, owner=owner, instant=instant)
     return shapes
 
 
@@ -69,15 +69,15 @@ def _parts(distractor: Distractor, pose: float, plan: GroundPlan) -> list[Shape]
             return figure(texture, distractor.head or texture, 0.06 + 0.26 * pose, pose, bend_deg=bend)
         case "twin":
             return [
-                *parts_of("base of a twin", texture),
-                *placed(figure(texture, texture, 0.07, 0.8), (0, 0, 0.12), 0.0),
+                *object_shapes("base of a twin", texture),
+                *transformed(figure(texture, texture, 0.07, 0.8), (0, 0, 0.12), 0.0),
             ]
         case "parcel":
             top = Shape(BOX, (0, 0, 0.2), (0.24, 0.22, 0.2), texture, offset=(0.35, 0.6))
             below = Shape(BOX, (0, 0, 0.35), (0.36, 0.28, 0.35), texture)
-            return [below, *placed([top], (0.05, 0, 0.7), 30.0)]
+            return [below, *transformed([top], (0.05, 0, 0.7), 30.0)]
         case "pole" | "banner":
-            return parts_of(distractor.kind, texture)
+            return object_shapes(distractor.kind, texture)
         case "barrier":
             return barrier(texture)
         case "placard":
@@ -97,19 +97,21 @@ def _tinted(shape: Shape, distractor: Distractor) -> Shape:
     return replace(shape, tint=(r, g, b))
 
 
-def mover_shapes(spec: CaptureSpec, placements: tuple[DistractorPose, ...], plan: GroundPlan) -> list[Shape]:
+def all_distractor_shapes(
+    spec: CaptureSpec, placements: tuple[DistractorPose, ...], plan: GroundPlan
+) -> list[Shape]:
     """Return all distractors of one photo."""
-    shapes = [s for p in placements for s in shapes_of(spec.distractors[p.which], p, plan)]
+    shapes = [s for p in placements for s in distractor_shapes(spec.distractors[p.which], p, plan)]
     gloss = spec.effects.specular
     return shapes if gloss is None else specular(shapes, gloss.textures, gloss.strength, gloss.sharpness)
 
 
-def movers(spec: CaptureSpec, placements: tuple[DistractorPose, ...], world: World) -> ShapeTable:
+def distractor_table(spec: CaptureSpec, placements: tuple[DistractorPose, ...], world: World) -> ShapeTable:
     """Return all distractors of one photo as a table for the ray caster."""
-    return shape_table(mover_shapes(spec, placements, world.plan), world.atlas)
+    return shape_table(all_distractor_shapes(spec, placements, world.plan), world.atlas)
 
 
-def lay_out(
+def place_distractors(
     spec: CaptureSpec, cameras: list[Camera], world: World, rng: np.random.Generator
 ) -> list[tuple[DistractorPose, ...]]:
     """Place the distractors of every train photo.
@@ -142,7 +144,7 @@ def lay_out(
         _, depth_m = first_hits(small, static)
         for attempt in range(tries):
             layout = _draw(spec, camera, world, chosen, rng, present)
-            seen, _ = first_hits(small, movers(spec, layout, world), depth_m)
+            seen, _ = first_hits(small, distractor_table(spec, layout, world), depth_m)
             share = float(np.mean(seen >= 0))
             tolerance = (high - low) * (0.1 + 0.4 * attempt / tries)
             gap = max(abs(share - aim) - tolerance, 0.0) + 10 * max(low - share, share - high, 0.0)

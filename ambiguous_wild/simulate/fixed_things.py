@@ -20,7 +20,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _FINE = 4  # subpixels a side with which edges are drawn
 
 
-def fixed_layer(
+def overlay_layer(
     thing: FixedThing,
     photo: np.ndarray,  # [H, W, 3] float32, linear light
     number: int,  # of the photo, from 0: a stamp's time
@@ -78,7 +78,7 @@ def _stamp(height: int, width: int, number: int) -> np.ndarray:
     return np.concatenate([alpha * np.array(_STAMP_LIGHT, np.float32), alpha], axis=2)
 
 
-def laid_over(
+def alpha_over(
     upper: np.ndarray,  # [H, W, 4] float32: linear RGB times alpha, alpha
     lower: np.ndarray,  # the same, or [H, W, 3] of a photo
 ) -> np.ndarray:

@@ -109,7 +109,7 @@ def draw_iso_noise(settings: IsoNoise, random: PhotoRandom) -> float:
     return float(random.rng("iso_noise").uniform(*settings.iso))
 
 
-def pattern(random: PhotoRandom, height: int, width: int) -> np.ndarray:
+def normal_noise(random: PhotoRandom, height: int, width: int) -> np.ndarray:
     """Draw standard normal numbers [H, W, 3] float32, the same for a photo and its clean version."""
     return random.rng("iso_noise pattern").standard_normal((height, width, 3), dtype=np.float32)
 
@@ -148,7 +148,7 @@ def draw_defocus(settings: Defocus, random: PhotoRandom) -> float:
     return float(radius) if out_of_focus else 0.0
 
 
-def disc(radius_px: float) -> np.ndarray:
+def disc_kernel(radius_px: float) -> np.ndarray:
     """Return the point spread function, [K, K] float32, sum 1: a disc with an anti-aliased rim."""
     reach = int(np.ceil(radius_px + 0.5 - 1e-9))
     fine = (np.arange((2 * reach + 1) * _FINE) + 0.5) / _FINE - reach - 0.5
@@ -269,7 +269,7 @@ def lens_distortion(
     return points * scale[..., None]
 
 
-def hand_velocity(random: PhotoRandom, speed_deg_s: float) -> np.ndarray:
+def camera_angular_velocity(random: PhotoRandom, speed_deg_s: float) -> np.ndarray:
     """Draw the angular velocity in camera axes, [3] rad/s: mostly pitch and yaw, a third of it roll.
 
     Its length is 0.3 to 1 times `speed_deg_s`. The direction does not depend on the speed, so blur and
@@ -280,7 +280,7 @@ def hand_velocity(random: PhotoRandom, speed_deg_s: float) -> np.ndarray:
     return np.deg2rad(speed_deg_s) * rng.uniform(0.3, 1.0) * direction / np.linalg.norm(direction)
 
 
-def hand_turns(
+def camera_rotations(
     velocity: np.ndarray,  # [3] rad/s, camera axes
     seconds: float,  # of the exposure, or of reading all rows
     steps: int,  # instants of the exposure, or rows
@@ -293,14 +293,14 @@ def hand_turns(
     return seconds * instants[:, None] * velocity
 
 
-def fine_points(camera: Camera, fine: int) -> np.ndarray:
+def subpixel_points(camera: Camera, fine: int) -> np.ndarray:
     """Return normalised coordinates [H fine, W fine, 2] of the photo's fine pixels."""
     u = ((np.arange(camera.width * fine) + 0.5) / fine - camera.cx) / camera.fx
     v = ((np.arange(camera.height * fine) + 0.5) / fine - camera.cy) / camera.fy
     return np.stack(np.meshgrid(u, v), axis=-1)
 
 
-def turned(points: np.ndarray, turns: np.ndarray) -> np.ndarray:
+def rotated_points(points: np.ndarray, turns: np.ndarray) -> np.ndarray:
     """Return the points as seen by the camera before it turned.
 
     Args:
@@ -320,12 +320,12 @@ def turned(points: np.ndarray, turns: np.ndarray) -> np.ndarray:
     return rays[..., :2] / rays[..., 2:]
 
 
-def in_pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
+def to_pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Convert normalised points to px of the pinhole camera, [..., 2]."""
     return points * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
-def enlarged(camera: Camera, sources: list[np.ndarray], fine: int) -> tuple[Camera, int]:
+def supersampled_camera(camera: Camera, sources: list[np.ndarray], fine: int) -> tuple[Camera, int]:
     """Return a finer camera that covers all sources, and its border in coarse px."""
     low = min(float(s.min()) for s in sources)
     high = max(float((s - (camera.width, camera.height)).max()) for s in sources)

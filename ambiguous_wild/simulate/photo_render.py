@@ -20,8 +20,8 @@ import numpy as np
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.core.srgb import srgb_to_linear
 from ambiguous_wild.simulate import image_effects as fx
-from ambiguous_wild.simulate.distractors import DistractorPose, mover_shapes
-from ambiguous_wild.simulate.fixed_things import fixed_layer, laid_over
+from ambiguous_wild.simulate.distractors import DistractorPose, all_distractor_shapes
+from ambiguous_wild.simulate.fixed_things import alpha_over, overlay_layer
 from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.kernels import DOME
 from ambiguous_wild.simulate.shapes import Shape, shape_table
@@ -86,20 +86,20 @@ def prepare_photo(
     spec: CaptureSpec, world: World, planned: PlannedPhoto, random: PhotoRandom
 ) -> PreparedPhoto:
     """Do the steps before the rays are traced."""
-    effects = spec.effects if planned.split == "train" else _lasting(spec.effects)
+    effects = spec.effects if planned.split == "train" else _constant_effects(spec.effects)
     drawn: DrawnEffects = {}
-    shapes = mover_shapes(spec, planned.placements, world.plan)
+    shapes = all_distractor_shapes(spec, planned.placements, world.plan)
     scene = _lit(effects, world, random, drawn, shapes if spec.cast_shadows else None)
     move, camera, light = _optics(effects, planned.camera, scene.light, random, drawn)
     distractors = shape_table(shapes, world.atlas)
     fixed = spec.fixed if planned.split == "train" else None
-    names = ["", *things_of(world)]
+    names = ["", *static_object_names(world)]
     things = np.array([names.index(s.thing) for s in world.shapes], np.uint8)
     lit = replace(scene, light=light)
     return PreparedPhoto(effects, lit, camera, distractors, fixed, move, things, drawn)
 
 
-def things_of(world: World) -> list[str]:
+def static_object_names(world: World) -> list[str]:
     """Return the names of the static objects that a distractor may be taken for, numbered from 1."""
     return sorted({s.thing for s in world.shapes if s.thing})
 
@@ -125,8 +125,8 @@ def finish_photo(
     effects, drawn = prepared.effects, prepared.drawn
     distracted, clean, owner, shadow = _moved(prepared.move, traced)
     if prepared.fixed is not None:
-        top = fixed_layer(prepared.fixed, distracted, random.number, random.seed)
-        distracted, owner = laid_over(top, distracted), np.where(top[..., 3] > 0, FIXED, owner)
+        top = overlay_layer(prepared.fixed, distracted, random.number, random.seed)
+        distracted, owner = alpha_over(top, distracted), np.where(top[..., 3] > 0, FIXED, owner)
     sensor = _sensor(effects, planned.camera, random, drawn)
     clean_pixels = _to_uint8(sensor(clean))
     pixels = clean_pixels if distracted is clean else _to_uint8(sensor(distracted))
@@ -165,7 +165,7 @@ def compile_tracer() -> None:
     first_hits(camera, nothing)
 
 
-def _lasting(effects: Effects) -> Effects:
+def _constant_effects(effects: Effects) -> Effects:
     """Return the effects that are the same in all photos, which test photos get too."""
     return Effects(specular=effects.specular, lens_distortion=effects.lens_distortion)
 
@@ -209,14 +209,14 @@ def _optics(
     if effects.lens_distortion is not None or any(s is not None for s in shutter):
         fine = math.isqrt(len(light.sun))  # one ray in each finer pixel, so the number of rays stays
         sources = _sources(effects, camera, fine, random, drawn)
-        traced, border = fx.enlarged(camera, sources, fine)
+        traced, border = fx.supersampled_camera(camera, sources, fine)
         light = replace(light, sun=np.ascontiguousarray(light.sun[:1]))
         steps.append(lambda image: fx.resample(image, sources, border, fine))
     if effects.defocus is not None:
         radius = fx.draw_defocus(effects.defocus, random)
         drawn["defocus"] = {"radius_px": radius * camera.width}
         if radius > 0:
-            kernel = fx.disc(radius * camera.width)
+            kernel = fx.disc_kernel(radius * camera.width)
             steps.append(lambda image: fx.defocus(image, kernel))
     if not steps:
         return None, traced, light
@@ -232,7 +232,7 @@ def _sources(
     effects: Effects, camera: Camera, fine: int, random: PhotoRandom, drawn: DrawnEffects
 ) -> list[np.ndarray]:
     """Return where the photo's fine pixels lie in the pinhole camera, one array per instant of exposure."""
-    points = fx.fine_points(camera, fine)
+    points = fx.subpixel_points(camera, fine)
     if effects.lens_distortion is not None:
         lens = effects.lens_distortion
         points = fx.lens_distortion(points, lens.k1, lens.k2)
@@ -242,19 +242,19 @@ def _sources(
     instants = np.zeros((1, 3))
     if effects.rolling_shutter is not None:
         roll = effects.rolling_shutter
-        velocity = fx.hand_velocity(random, roll.speed_deg_s)
-        turns = fx.hand_turns(velocity, roll.readout_s, rows)
+        velocity = fx.camera_angular_velocity(random, roll.speed_deg_s)
+        turns = fx.camera_rotations(velocity, roll.readout_s, rows)
         drawn["rolling_shutter"] = {"deg_s": np.rad2deg(velocity).tolist(), "readout_s": roll.readout_s}
     if effects.motion_blur is not None:
         blur = effects.motion_blur
-        velocity = fx.hand_velocity(random, blur.speed_deg_s)
+        velocity = fx.camera_angular_velocity(random, blur.speed_deg_s)
         length = float(np.linalg.norm(velocity)) * blur.exposure_s * camera.fx
         count = min(max(2, math.ceil(length * fine)), _MAX_INSTANTS)
-        instants = fx.hand_turns(velocity, blur.exposure_s, count)
+        instants = fx.camera_rotations(velocity, blur.exposure_s, count)
         drawn["motion_blur"] = {"exposure_s": blur.exposure_s, "length_px": length}
     if not turns.any() and not instants.any():
-        return [fx.in_pixels(points, camera)]
-    return [fx.in_pixels(fx.turned(points, turns + now), camera) for now in instants]
+        return [fx.to_pixels(points, camera)]
+    return [fx.to_pixels(fx.rotated_points(points, turns + now), camera) for now in instants]
 
 
 def _moved(
@@ -302,7 +302,7 @@ def _sensor(effects: Effects, camera: Camera, random: PhotoRandom, drawn: DrawnE
         steps.append(lambda image: fx.white_balance(image, gains))
     if effects.iso_noise is not None:
         iso = fx.draw_iso_noise(effects.iso_noise, random)
-        normal = fx.pattern(random, camera.height, camera.width)
+        normal = fx.normal_noise(random, camera.height, camera.width)
         drawn["iso_noise"] = {"iso": iso}
         steps.append(lambda image: fx.iso_noise(image, normal, iso))
 

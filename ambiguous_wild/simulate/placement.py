@@ -19,7 +19,7 @@ from ambiguous_wild.simulate.cutouts import (
     Cutout,
     CutoutPlacement,
     cut_patch,
-    layer,
+    draw_layer,
 )
 from ambiguous_wild.simulate.spec import FixedThing
 
@@ -76,14 +76,14 @@ def visible_points(scene: Scene) -> list[VisiblePoints]:
     sites = []
     for view in scene.train:
         index = scene.views.index(view)
-        sites.append(_site(view, scene.points, np.unique(owner[scene.points.track_views == index])))
+        sites.append(_visible_points(view, scene.points, np.unique(owner[scene.points.track_views == index])))
     bare = [s.view.name for s in sites if len(s.xyz) < 3]
     if bare:
         raise AwError(f"{scene.root}: {len(bare)} train photos see fewer than 3 points, e.g. {bare[0]}")
     return sites
 
 
-def _site(view: View, points: SparsePoints, tracked: np.ndarray) -> VisiblePoints:
+def _visible_points(view: View, points: SparsePoints, tracked: np.ndarray) -> VisiblePoints:
     xyz = points.xyz[tracked] if len(tracked) >= 10 else points.xyz
     camera = view.camera
     uv, _ = camera.project(xyz)
@@ -97,7 +97,7 @@ def scene_spread(scene: Scene) -> float:
     return float(np.median(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)))
 
 
-def place(
+def place_cutouts(
     sites: Sequence[VisiblePoints],
     spread: float,
     config: CompositeConfig,
@@ -192,7 +192,9 @@ def solve_heights(
     natural = natural / natural.max()
 
     def share(scale: float) -> float:
-        shares = [covered(small, natural * scale, s, c) for s, c in zip(placements, cameras, strict=True)]
+        shares = [
+            covered_share(small, natural * scale, s, c) for s, c in zip(placements, cameras, strict=True)
+        ]
         return float(np.mean(shares))
 
     depths = [
@@ -209,7 +211,7 @@ def solve_heights(
             f"--coverage {config.coverage:g} is more than {len(cutouts)} cut-outs can cover "
             f"({share(high):.2f} at their largest); lower it, raise --presence or add cut-outs"
         )
-    return natural * bisected(share, high, config.coverage)
+    return natural * bisect_scale(share, high, config.coverage)
 
 
 def longest_side(heights: np.ndarray, cutouts: Sequence[Cutout]) -> float:
@@ -217,7 +219,7 @@ def longest_side(heights: np.ndarray, cutouts: Sequence[Cutout]) -> float:
     return float(max(h * max(1.0, c.aspect) for h, c in zip(heights, cutouts, strict=True)))
 
 
-def bisected(share: Callable[[float], float], high: float, wanted: float) -> float:
+def bisect_scale(share: Callable[[float], float], high: float, wanted: float) -> float:
     """Return the scale up to `high` at which `share`, which grows with it, is the wanted one."""
     low = 0.0
     for _ in range(14):
@@ -232,11 +234,11 @@ def _preview(view: View) -> Camera:
     return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 
-def covered(
+def covered_share(
     cutouts: Sequence[Cutout], heights: np.ndarray, placements: Sequence[CutoutPlacement], camera: Camera
 ) -> float:
     """Return the share of a photo's pixels that cut-outs of these heights mark as distractor."""
-    over = layer(cutouts, list(heights), placements, camera)
+    over = draw_layer(cutouts, list(heights), placements, camera)
     return float((over[..., 3] >= TRUTH_COVER).mean())
 
 

@@ -9,15 +9,15 @@ import numpy as np
 from ambiguous_wild.simulate import built_textures as built
 from ambiguous_wild.simulate import textures as tx
 from ambiguous_wild.simulate.kernels import BOX, ELLIPSOID, PLANAR, QUAD
-from ambiguous_wild.simulate.shapes import Shape, between, placed, vector
+from ambiguous_wild.simulate.shapes import Shape, capsule_between, transformed, vector
 from ambiguous_wild.simulate.spec import PLANS, WorldSpec
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
     World,
     baked_sheets,
     box,
+    object_shapes,
     on_wall,
-    parts_of,
     poster,
     statue,
     sunlight,
@@ -61,9 +61,9 @@ def room(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
     }
     shapes = [*_hull(), *_pictures(streams[4]), *shapes]
     if what.statue:
-        bust = placed([statue("bust", "stone", 0.75)], (0, 0, 0.87), 0.0, thing="statue")
-        pedestal = [*parts_of("room pedestal"), *bust]
-        shapes += placed(pedestal, hub, float(rng.uniform(-20, 20)))
+        bust = transformed([statue("bust", "stone", 0.75)], (0, 0, 0.87), 0.0, thing="statue")
+        pedestal = [*object_shapes("room pedestal"), *bust]
+        shapes += transformed(pedestal, hub, float(rng.uniform(-20, 20)))
     # The sun comes in through the windows; light reflected by walls is part of the sky light.
     light = sunlight(rng, samples, (-178.0, -165.0), (26.0, 34.0), sky=1.4)
     return world_of(PLAN, what, shapes, circles, textures, d, light, hub)
@@ -94,7 +94,7 @@ def _hull() -> list[Shape]:
         box(door, (0.03, 0.46, 1.02), 0, "timber", tint=(1.5, 1.5, 1.4)),
         box(on_wall(PLAN, "wall_right", 1.9, 1.05, 0.01), (0.015, 0.54, 1.09), 0, "stone", tint=WHITE),
         Shape(ELLIPSOID, on_wall(PLAN, "wall_right", 1.55, 1.0, 0.09), (0.05, 0.05, 0.03), "enamel"),
-        between((0, 0.4, 2.7), (0, 0.4, 2.25), 0.012, "asphalt"),
+        capsule_between((0, 0.4, 2.7), (0, 0.4, 2.25), 0.012, "asphalt"),
         Shape(ELLIPSOID, (0, 0.4, 2.2), (0.24, 0.24, 0.13), "cloth", tint=(0.9, 0.75, 0.5)),
     ]
     return shapes
@@ -121,7 +121,9 @@ def _window(name: str, left: float, right: float, bottom: float, top: float) -> 
             at = on_wall(PLAN, name, x + side * 0.11 * fold, 1.2, 0.1)
             foot, head = (*at[:2], 0.12), (*at[:2], 2.45)
             shapes.append(
-                between(foot, head, 0.065, "cloth", tint=CURTAIN, offset=(0.2 * fold, 0.3 + 0.2 * side))
+                capsule_between(
+                    foot, head, 0.065, "cloth", tint=CURTAIN, offset=(0.2 * fold, 0.3 + 0.2 * side)
+                )
             )
     return shapes
 
@@ -167,7 +169,7 @@ def _shelf(rng: np.random.Generator, wide: float) -> list[Shape]:
     rows = [
         s
         for k in range(5)
-        for s in placed(_books(rng, wide - 0.06, 0.36), (-wide / 2 + 0.03, -0.02, 0.065 + 0.4 * k), 0)
+        for s in transformed(_books(rng, wide - 0.06, 0.36), (-wide / 2 + 0.03, -0.02, 0.065 + 0.4 * k), 0)
     ]
     return [*boards, *sides, back, *rows]
 
@@ -194,34 +196,34 @@ def _furniture(rng: np.random.Generator) -> tuple[list[Shape], list[Circle]]:
     ]  # fmt: skip
     circles: list[Circle] = []
     for x in (-2.9, -1.75, -0.6):
-        shapes += placed(_shelf(rng, 1.1), (x, 2.82, 0), 0)
+        shapes += transformed(_shelf(rng, 1.1), (x, 2.82, 0), 0)
         circles.append((x, 2.82, 0.55))
     sofa = (-3.1, float(rng.uniform(-0.3, 0.0)), 0.0)
-    shapes += placed(parts_of("sofa"), sofa, 0.0)
+    shapes += transformed(object_shapes("sofa"), sofa, 0.0)
     circles += [(sofa[0], sofa[1] + dy, 0.6) for dy in (-0.5, 0.5)]
     table = (float(rng.uniform(2.0, 2.15)), float(rng.uniform(0.1, 0.3)), 0.0)
     top = [
-        *parts_of("table"),
+        *object_shapes("table"),
         *_leaves(rng, (0.1, 0.25, 1.1), 0.12, (0.1, 0.1, 0.12), 5),
-        *parts_of("bowl"),
-        *placed(_books(rng, 0.22, 0.3), (-0.3, 0.4, 0.76), 15.0),
+        *object_shapes("bowl"),
+        *transformed(_books(rng, 0.22, 0.3), (-0.3, 0.4, 0.76), 15.0),
     ]
-    shapes += placed(top, table, 0.0)
+    shapes += transformed(top, table, 0.0)
     circles.append((table[0], table[1], 0.85))
     for x, y, yaw in ((-0.62, -0.25, -90.0), (-0.6, 0.35, -80.0), (0.0, -1.0, 180.0), (0.05, 1.0, 10.0)):
         at = (table[0] + x, table[1] + y, 0.0)
-        shapes += placed(parts_of("chair"), at, yaw + float(rng.uniform(-15, 15)))
+        shapes += transformed(object_shapes("chair"), at, yaw + float(rng.uniform(-15, 15)))
         circles.append((at[0], at[1], 0.3))
     cupboard = [
-        *parts_of("cupboard"),
+        *object_shapes("cupboard"),
         *_leaves(rng, (0.35, 0, 1.2), 0.16, (0.13, 0.13, 0.17), 6),
-        *parts_of("radio"),
+        *object_shapes("radio"),
     ]
-    shapes += placed(cupboard, (1.9, 2.72, 0), 0)
+    shapes += transformed(cupboard, (1.9, 2.72, 0), 0)
     circles.append((1.9, 2.72, 0.7))
     lamp = (-2.9, 1.75, 0.0)
-    shapes += placed(parts_of("floor lamp"), lamp, 0.0)
+    shapes += transformed(object_shapes("floor lamp"), lamp, 0.0)
     circles.append((lamp[0], lamp[1], 0.25))
-    shapes += placed(parts_of("books on a crate"), (-1.55, 1.75, 0), float(rng.uniform(10, 40)))
+    shapes += transformed(object_shapes("books on a crate"), (-1.55, 1.75, 0), float(rng.uniform(10, 40)))
     circles.append((-1.55, 1.75, 0.35))
     return shapes, circles

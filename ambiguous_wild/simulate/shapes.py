@@ -202,7 +202,7 @@ def shape_table(shapes: Iterable[Shape], atlas: Atlas) -> ShapeTable:
     )
 
 
-def between(
+def capsule_between(
     start: Sequence[float],
     end: Sequence[float],
     radius: float,
@@ -229,7 +229,7 @@ def vector(values: Iterable[float]) -> Vector:
     return x, y, z
 
 
-def placed(
+def transformed(
     shapes: Iterable[Shape], at: Sequence[float], yaw_deg: float, size: float = 1.0, **more: Any
 ) -> list[Shape]:
     """Turn shapes about z, scale them and move them to `at`, with their textures; `more`: fields to set."""
@@ -255,7 +255,7 @@ def placed(
     return moved
 
 
-def bent(shapes: Iterable[Shape], angle_deg: float, hinge_m: float) -> list[Shape]:
+def bend_forward(shapes: Iterable[Shape], angle_deg: float, hinge_m: float) -> list[Shape]:
     """Turn shapes forwards, towards -y, about the x axis at a height."""
     c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
 
@@ -286,33 +286,33 @@ def figure(
     hand = (0.32, -0.12 - 0.42 * lift, 0.82 + 0.5 * lift)
     elbow = (0.34, -0.02 - 0.15 * lift, 1.12)
     lower = [
-        between((-0.1, 0, 0.85), (-0.11, -stride, 0.09), 0.085, body, **legs),
-        between((0.1, 0, 0.85), (0.11, stride, 0.09), 0.085, body, **legs),
+        capsule_between((-0.1, 0, 0.85), (-0.11, -stride, 0.09), 0.085, body, **legs),
+        capsule_between((0.1, 0, 0.85), (0.11, stride, 0.09), 0.085, body, **legs),
         Shape(ELLIPSOID, (-0.11, -stride - 0.06, 0.06), (0.065, 0.15, 0.065), body, tint=(tint * 0.7,) * 3),
         Shape(ELLIPSOID, (0.11, stride - 0.06, 0.06), (0.065, 0.15, 0.065), body, tint=(tint * 0.7,) * 3),
         Shape(ELLIPSOID, (0, 0, 0.86), (0.23, 0.18, 0.34), body, offset=(0.62, 0.45)),
     ]
     upper = [
         Shape(ELLIPSOID, (0, 0, 1.2), (0.235, 0.155, 0.32), body),
-        between((-0.2, 0, 1.4), (0.2, 0, 1.4), 0.085, body),
-        between((-0.26, 0, 1.38), (-0.33, 0.03, 1.1), 0.068, body, offset=(0.35, 0.6)),
-        between((-0.33, 0.03, 1.1), (-0.3, -0.1, 0.84), 0.06, body, offset=(0.3, 0.35)),
-        between((0.26, 0, 1.38), elbow, 0.068, body, offset=(0.7, 0.6)),
-        between(elbow, hand, 0.06, body, offset=(0.6, 0.4)),
+        capsule_between((-0.2, 0, 1.4), (0.2, 0, 1.4), 0.085, body),
+        capsule_between((-0.26, 0, 1.38), (-0.33, 0.03, 1.1), 0.068, body, offset=(0.35, 0.6)),
+        capsule_between((-0.33, 0.03, 1.1), (-0.3, -0.1, 0.84), 0.06, body, offset=(0.3, 0.35)),
+        capsule_between((0.26, 0, 1.38), elbow, 0.068, body, offset=(0.7, 0.6)),
+        capsule_between(elbow, hand, 0.06, body, offset=(0.6, 0.4)),
         Shape(ELLIPSOID, hand, (0.055, 0.055, 0.07), head),
         Shape(ELLIPSOID, (-0.3, -0.11, 0.79), (0.05, 0.055, 0.07), head),
-        between((0, 0, 1.4), (0, -0.01, 1.55), 0.06, head),
+        capsule_between((0, 0, 1.4), (0, -0.01, 1.55), 0.06, head),
         Shape(ELLIPSOID, (0, -0.02, 1.635), (0.093, 0.112, 0.13), head, offset=(0.4, 0.55)),
         Shape(ELLIPSOID, (0, 0.015, 1.665), (0.102, 0.112, 0.115), body, tint=(0.35 * tint,) * 3),
     ]
-    return [*lower, *(bent(upper, bend_deg, _HIP_M) if bend_deg else upper)]
+    return [*lower, *(bend_forward(upper, bend_deg, _HIP_M) if bend_deg else upper)]
 
 
 def barrier(texture: str) -> list[Shape]:
     """Make two posts of 1 m, 1.5 m apart, and a rope of 3 cm that sags between them."""
-    posts = [between((x, 0, 0.02), (x, 0, 1.0), 0.022, texture) for x in (-0.75, 0.75)]
+    posts = [capsule_between((x, 0, 0.02), (x, 0, 1.0), 0.022, texture) for x in (-0.75, 0.75)]
     feet = [Shape(BOX, (x, 0, 0.015), (0.12, 0.12, 0.015), texture) for x in (-0.75, 0.75)]
     x = np.linspace(-0.75, 0.75, 9)
     knots = np.stack([x, np.zeros(9), 0.65 + 0.3 * (x / 0.75) ** 2], axis=1)
-    rope = [between(a, b, 0.015, texture) for a, b in pairwise(knots)]
+    rope = [capsule_between(a, b, 0.015, texture) for a, b in pairwise(knots)]
     return [*posts, *feet, *rope]

@@ -85,7 +85,7 @@ PLANS: Mapping[str, GroundPlan] = {
 
 
 @dataclass(frozen=True)
-class Designed:
+class ExpectedAmbiguity:
     """Label of a capture: the result that measuring it should give."""
 
     ambiguity: Literal["colour", "semantic", "both", "neither", "unstated"] = "unstated"
@@ -289,7 +289,7 @@ class CaptureSpec:
     fixed: FixedThing | None = None  # fixed to the camera, in every train photo, on top of `occlusion`
     # Distractors cast shadows on the scene; else what is outside of them equals the clean photo.
     cast_shadows: bool = False
-    designed: Designed = field(default_factory=Designed)
+    designed: ExpectedAmbiguity = field(default_factory=ExpectedAmbiguity)
 
     @property
     def has_shadows(self) -> bool:

@@ -96,7 +96,7 @@ def _brightness(name: str, scale: float) -> np.ndarray:
     return cv2.GaussianBlur(grey, (0, 0), 0.5 * scale) if scale > 1 else grey
 
 
-def laid(
+def mirrored_brightness(
     name: str, height: int, width: int, px_per_m: float, tile_m: float, angle_deg: float, shift: np.ndarray
 ) -> np.ndarray:
     """The photograph's brightness laid over a surface, mirrored at its seams: [H, W, 1], mean 1."""
@@ -116,12 +116,14 @@ def _mirrored(x: np.ndarray, size: int) -> np.ndarray:
     return np.where(folded > size - 1, period - folded, folded).astype(np.float32)
 
 
-def scattered(
+def blended_layers(
     name: str, rng: np.random.Generator, height: int, width: int, px_per_m: float, tile_m: float
 ) -> np.ndarray:
     """Three layers of one photograph at different angles and sizes, blended along noise: no repetition."""
     layers = [
-        laid(name, height, width, px_per_m, tile_m * size, angle + 40 * rng.random(), rng.random(2))
+        mirrored_brightness(
+            name, height, width, px_per_m, tile_m * size, angle + 40 * rng.random(), rng.random(2)
+        )
         for size, angle in ((1.0, 0), (1.27, 70), (0.85, 150))
     ]
     first = step(0.45, 0.55, octaves(rng, height, width, 0.9 * px_per_m))
@@ -133,8 +135,10 @@ def gravel_ground(rng: np.random.Generator, width_m: float, height_m: float, px_
     """Gravel with worn grass and a paved way through the middle, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     stones = gravel(rng, width_m, height_m, px_per_m)
-    lawn = scattered("grass", rng, h, w, px_per_m, 1.8) * tint(rng, h, w, px_per_m, (0.13, 0.2, 0.06), 0.5)
-    paving = laid("brick", h, w, px_per_m, 2.6, 8.0, rng.random(2))
+    lawn = blended_layers("grass", rng, h, w, px_per_m, 1.8) * tint(
+        rng, h, w, px_per_m, (0.13, 0.2, 0.06), 0.5
+    )
+    paving = mirrored_brightness("brick", h, w, px_per_m, 2.6, 8.0, rng.random(2))
     paving = paving * tint(rng, h, w, px_per_m, (0.3, 0.27, 0.25), 0.5)
     patches = octaves(rng, h, w, 1.6 * px_per_m, 6)
     ground = stones + (lawn - stones) * step(0.52, 0.6, patches)
@@ -169,14 +173,14 @@ def brick_wall(
     Without `foot` it is the middle of a wall: hardly any moss or plaster.
     """
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    courses = laid("brick", h, w, px_per_m, 1.9, 90.0, rng.random(2)) ** 1.2
+    courses = mirrored_brightness("brick", h, w, px_per_m, 1.9, 90.0, rng.random(2)) ** 1.2
     wall = courses * tint(rng, h, w, px_per_m, colour, 0.55)
     height = (np.arange(h) / px_per_m)[:, None]
     fallen = octaves(rng, h, w, 1.1 * px_per_m, 6) - (0.0 if foot else 0.2)
-    plaster = scattered("gravel", rng, h, w, px_per_m, 5.0) ** 0.35
+    plaster = blended_layers("gravel", rng, h, w, px_per_m, 5.0) ** 0.35
     plaster = plaster * tint(rng, h, w, px_per_m, (0.46, 0.4, 0.3), 0.25)
     wall = wall + (plaster - wall) * step(0.585, 0.605, fallen)
-    moss = scattered("grass", rng, h, w, px_per_m, 1.2) * np.array([0.09, 0.13, 0.04])
+    moss = blended_layers("grass", rng, h, w, px_per_m, 1.2) * np.array([0.09, 0.13, 0.04])
     damp = octaves(rng, h, w, 0.6 * px_per_m, 5) + (0.35 * np.exp(-height / 0.4) - 0.05 if foot else -0.2)
     wall = wall + 0.85 * (moss - wall) * step(0.58, 0.68, damp)
     streaks = cv2.GaussianBlur(uniform(rng, h, w), (0, 0), 2.0, sigmaY=0.5 * px_per_m) - 0.5
@@ -187,7 +191,7 @@ def brick_wall(
 def stone(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
     """Weathered sandstone with some lichen, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    grain = scattered("gravel", rng, h, w, px_per_m, 0.9) ** 0.7
+    grain = blended_layers("gravel", rng, h, w, px_per_m, 0.9) ** 0.7
     body = grain * tint(rng, h, w, px_per_m * 0.3, (0.40, 0.36, 0.28), 0.4)
     lichen = grain * np.array([0.26, 0.26, 0.15])
     body = body + 0.7 * (lichen - body) * step(0.6, 0.7, octaves(rng, h, w, 0.2 * px_per_m, 6))
@@ -199,7 +203,7 @@ def stone(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: f
 def foliage(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
     """Leaves, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    leaves = scattered("grass", rng, h, w, px_per_m, 0.9) ** 1.5
+    leaves = blended_layers("grass", rng, h, w, px_per_m, 0.9) ** 1.5
     clumps = 0.5 + 1.1 * step(0.35, 0.65, octaves(rng, h, w, 0.2 * px_per_m, 4))
     green = tint(rng, h, w, px_per_m * 0.5, (0.12, 0.19, 0.05), 0.6)
     return np.asarray(leaves * clumps * green, dtype=np.float32)
@@ -213,7 +217,7 @@ def timber(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: 
     grain = cv2.GaussianBlur(uniform(rng, h, w), (0, 0), 0.12 * px_per_m, sigmaY=0.8) - 0.5
     joint = np.abs((np.arange(h) / (0.14 * px_per_m)) % 1.0 - 0.5)[:, None] > 0.46
     value = tone * (1 + 4.0 * grain) * np.where(joint, 0.25, 1.0)
-    rough = scattered("gravel", rng, h, w, px_per_m, 2.0) ** 0.5
+    rough = blended_layers("gravel", rng, h, w, px_per_m, 2.0) ** 0.5
     brown = tint(rng, h, w, px_per_m, (0.3, 0.19, 0.1), 0.3)
     return np.asarray(np.clip(value, 0.1, 2)[..., None] * rough * brown, dtype=np.float32)
 
@@ -237,7 +241,7 @@ def brick(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: f
 def gravel(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: float) -> np.ndarray:
     """The ground's gravel, for objects, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
-    stones = scattered("gravel", rng, h, w, px_per_m, 2.2)
+    stones = blended_layers("gravel", rng, h, w, px_per_m, 2.2)
     return np.asarray(stones * tint(rng, h, w, px_per_m, (0.36, 0.32, 0.26), 0.35), dtype=np.float32)
 
 
@@ -247,7 +251,7 @@ def vivid(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: f
     colours = np.array([[0.75, 0.03, 0.4], [0.02, 0.45, 0.75], [0.85, 0.6, 0.02]])
     wave = np.arange(w)[None] / px_per_m + 0.4 * octaves(rng, h, w, 0.3 * px_per_m, 3)
     band = (wave / 0.16).astype(int) % 3
-    grain = scattered("gravel", rng, h, w, px_per_m, 1.5) ** 0.25
+    grain = blended_layers("gravel", rng, h, w, px_per_m, 1.5) ** 0.25
     return np.asarray(colours[band] * grain, dtype=np.float32)
 
 
@@ -255,7 +259,7 @@ def cloth(rng: np.random.Generator, width_m: float, height_m: float, px_per_m: f
     """White cloth with folds and a weave, to be tinted, [H, W, 3] linear light."""
     h, w = round(height_m * px_per_m), round(width_m * px_per_m)
     folds = np.clip(0.05 + 1.3 * octaves(rng, h, w, 0.35 * px_per_m, 3), 0.1, 1.2)
-    weave = scattered("gravel", rng, h, w, px_per_m, 1.5) ** 0.6
+    weave = blended_layers("gravel", rng, h, w, px_per_m, 1.5) ** 0.6
     return np.asarray(np.repeat((folds[..., None] * weave).mean(2, keepdims=True), 3, 2), dtype=np.float32)
 
 

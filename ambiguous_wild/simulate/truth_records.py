@@ -63,7 +63,7 @@ class CaptureTruth(TypedDict):
     identity: str  # hash of spec, seed and code
     version: dict[str, str]
     spec: dict[str, object]  # as in a YAML spec
-    designed: dict[str, object]  # `spec.Designed`
+    designed: dict[str, object]  # `spec.ExpectedAmbiguity`
     mask: str  # what the masks mark, in words
     clean: str
     test: str

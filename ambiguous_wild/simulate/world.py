@@ -33,10 +33,10 @@ from ambiguous_wild.simulate.shapes import (
     Axes,
     Shape,
     Vector,
-    between,
+    capsule_between,
     figure,
-    placed,
     shape_table,
+    transformed,
     vector,
 )
 from ambiguous_wild.simulate.spec import POSTERS, STATUES, GroundPlan, Thing, WorldSpec
@@ -88,13 +88,13 @@ def board(
 
 def placard(texture: str, plan: GroundPlan) -> list[Shape]:
     """Make a board of 1.1 x 0.85 m on two sticks, 0.75 m above the ground."""
-    sticks = [between((x, 0.03, 0.02), (x, 0.03, 1.5), 0.018, "timber") for x in (-0.45, 0.45)]
+    sticks = [capsule_between((x, 0.03, 0.02), (x, 0.03, 1.5), 0.018, "timber") for x in (-0.45, 0.45)]
     return [board(texture, 1.1, 0.85, 0.03, plan, 0.75), *sticks]
 
 
 def car(texture: str, length_m: float = 4.1, paint: Vector = (1.0, 1.0, 1.0)) -> list[Shape]:
     """Make a small car at the origin that faces +x: body in a tint of the texture, glass, wheels, lamps."""
-    return placed(parts_of("car", texture, paint), (0, 0, 0), 0.0, length_m / 4.1)
+    return transformed(object_shapes("car", texture, paint), (0, 0, 0), 0.0, length_m / 4.1)
 
 
 @cache
@@ -102,7 +102,7 @@ def _objects() -> dict[str, list[dict[str, Any]]]:
     return plain_yaml.read_mapping(Path(__file__).with_name("objects.yaml"))
 
 
-def parts_of(name: str, texture: str = "", own_tint: Vector = (1.0, 1.0, 1.0)) -> list[Shape]:
+def object_shapes(name: str, texture: str = "", own_tint: Vector = (1.0, 1.0, 1.0)) -> list[Shape]:
     """Make an object of `objects.yaml` at the origin; parts without a texture of their own get these."""
     shapes = []
     for part in _objects()[name]:
@@ -112,7 +112,7 @@ def parts_of(name: str, texture: str = "", own_tint: Vector = (1.0, 1.0, 1.0)) -
             more["tint"] = own_tint
         if "from" in part:
             kind = CAPSULE if part["shape"] == "rod" else CYLINDER
-            shapes.append(between(part["from"], part["to"], part["radius"], shown, kind, **more))
+            shapes.append(capsule_between(part["from"], part["to"], part["radius"], shown, kind, **more))
         else:
             kind = BOX if part["shape"] == "box" else ELLIPSOID
             shapes.append(Shape(kind, tuple(part["at"]), tuple(part["half"]), shown, **more))
@@ -127,7 +127,7 @@ def mirror_of(thing: Thing) -> Shape:
     share = MIRRORS[thing.kind]
     half = (width / 2 - FRAME_M, height / 2 - FRAME_M, 0.0)
     shape = Shape(QUAD, (0.0, front, height / 2), half, thing.texture, axes, tint=(share, share, share))
-    return placed([shape], thing.at_m, thing.yaw_deg)[0]
+    return transformed([shape], thing.at_m, thing.yaw_deg)[0]
 
 
 def _frame(thing: Thing) -> list[Shape]:
@@ -146,7 +146,7 @@ def _frame(thing: Thing) -> list[Shape]:
     return parts
 
 
-def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
+def thing_shapes(thing: Thing, plan: GroundPlan) -> list[Shape]:
     """Make the shapes of a thing of the spec, in the world."""
     width, depth, height = thing.size_m
     half = (width / 2, depth / 2, height / 2)
@@ -154,7 +154,7 @@ def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
     if thing.kind in STATUES:
         parts = [statue(thing.kind, thing.texture, height)]
     elif thing.kind == "figure":
-        parts = placed(figure(thing.texture, thing.texture, 0.07, 0.8), (0, 0, 0), 0.0, height / 1.75)
+        parts = transformed(figure(thing.texture, thing.texture, 0.07, 0.8), (0, 0, 0), 0.0, height / 1.75)
     elif thing.kind == "board":
         parts = [board(thing.texture, width, height, depth, plan)]
     elif thing.kind == "car":
@@ -162,7 +162,7 @@ def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
     elif thing.kind in MIRRORS:
         parts = _frame(thing)
     elif thing.kind == "column":
-        parts = [between((0, 0, 0), (0, 0, height), width / 2, thing.texture, CYLINDER)]
+        parts = [capsule_between((0, 0, 0), (0, 0, height), width / 2, thing.texture, CYLINDER)]
     else:
         parts = [Shape(ELLIPSOID if thing.kind == "ball" else BOX, middle, half, thing.texture)]
     tint = (1.0, 1.0, 1.0) if thing.kind == "car" else thing.tint
@@ -178,10 +178,10 @@ def shapes_of_thing(thing: Thing, plan: GroundPlan) -> list[Shape]:
         )
         for s in parts
     ]
-    return placed(parts, thing.at_m, thing.yaw_deg)
+    return transformed(parts, thing.at_m, thing.yaw_deg)
 
 
-def circle_of(thing: Thing) -> tuple[float, float, float]:
+def thing_footprint(thing: Thing) -> tuple[float, float, float]:
     """Return x, y and radius in m of the circle on the ground in which no distractor may stand."""
     width, depth, height = thing.size_m
     if thing.at_m[2] >= OVERHEAD_M:
@@ -222,9 +222,9 @@ def world_of(
     things = [
         replace(s, thing="" if thing.kind in MIRRORS else f"thing {number}")
         for number, thing in enumerate(what.things)
-        for s in shapes_of_thing(thing, plan)
+        for s in thing_shapes(thing, plan)
     ]
-    circles = [*circles, *map(circle_of, what.things)]
+    circles = [*circles, *map(thing_footprint, what.things)]
     _shade_feet(textures["ground"], circles, detail_px_per_m, plan)
     keep_out = np.array(circles, float).reshape(-1, 3)
     shapes = (*_ground_and_sky(plan), *shapes, *things)
@@ -269,7 +269,7 @@ def _ground_and_sky(plan: GroundPlan) -> list[Shape]:
 def box(center: Sequence[float], half: Sequence[float], yaw_deg: float, texture: str, **more: Any) -> Shape:
     """Make a box turned about z."""
     shape = Shape(BOX, (0, 0, 0), vector(half), texture, **more)
-    return placed([shape], center, yaw_deg)[0]
+    return transformed([shape], center, yaw_deg)[0]
 
 
 def wall(

@@ -10,7 +10,7 @@ import numpy as np
 from ambiguous_wild.simulate import built_textures as built
 from ambiguous_wild.simulate import textures as tx
 from ambiguous_wild.simulate.kernels import BOX, CYLINDER, ELLIPSOID
-from ambiguous_wild.simulate.shapes import Shape, between, figure, placed, vector
+from ambiguous_wild.simulate.shapes import Shape, capsule_between, figure, transformed, vector
 from ambiguous_wild.simulate.spec import PLANS, WorldSpec
 from ambiguous_wild.simulate.world import (
     WALL_AXES,
@@ -18,8 +18,8 @@ from ambiguous_wild.simulate.world import (
     baked_sheets,
     box,
     car,
+    object_shapes,
     on_wall,
-    parts_of,
     poster,
     sunlight,
     wall,
@@ -71,9 +71,9 @@ def yard(rng: np.random.Generator, detail_px_per_m: float, samples: int, what: W
     }
     shapes = [*_fronts(streams[2]), *shapes]
     if what.statue:
-        person = placed(figure("stone", "stone", 0.07, 0.8), (0, 0, 0.75), 0.0, thing="statue")
-        plinth = [*parts_of("yard plinth"), *person]
-        shapes += placed(plinth, foot, float(rng.uniform(-110, -70)))
+        person = transformed(figure("stone", "stone", 0.07, 0.8), (0, 0, 0.75), 0.0, thing="statue")
+        plinth = [*object_shapes("yard plinth"), *person]
+        shapes += transformed(plinth, foot, float(rng.uniform(-110, -70)))
     light = sunlight(rng, samples, (-150.0, -120.0), (48.0, 58.0))
     return world_of(PLAN, what, shapes, circles, textures, d, light, hub)
 
@@ -98,11 +98,11 @@ def _fronts(rng: np.random.Generator) -> list[Shape]:
 def _tree(rng: np.random.Generator) -> list[Shape]:
     """Make a tree of about 5 m."""
     height = rng.uniform(1.9, 2.4)
-    shapes = [between((0, 0, 0), (0.08, 0.04, height), 0.13, "timber", offset=(0.4, 0.1))]
+    shapes = [capsule_between((0, 0, 0), (0.08, 0.04, height), 0.13, "timber", offset=(0.4, 0.1))]
     for _ in range(4):
         a = rng.uniform(0, 2 * np.pi)
         reach = (0.08 + 0.5 * np.cos(a), 0.04 + 0.5 * np.sin(a), height + rng.uniform(0.5, 1.0))
-        shapes.append(between((0.08, 0.04, height - 0.2), reach, 0.05, "timber"))
+        shapes.append(capsule_between((0.08, 0.04, height - 0.2), reach, 0.05, "timber"))
     for _ in range(16):
         # No leaves float apart from the crown.
         at = np.array([0.08, 0.04, height + 1.0]) + np.clip(rng.normal(0, 1, 3), -1.2, 1.2) * (0.6, 0.6, 0.5)
@@ -119,20 +119,20 @@ def _standing(rng: np.random.Generator) -> tuple[list[Shape], list[Circle]]:
     for number, (x, y, yaw, paint) in enumerate(_PARKED):
         x, y = x + rng.uniform(-0.2, 0.2), y + rng.uniform(-0.25, 0.25)
         offset = (float(rng.random()), float(rng.random()))
-        for part in placed(car("enamel"), (x, y, 0), yaw + rng.uniform(-3, 3), rng.uniform(0.96, 1.06)):
+        for part in transformed(car("enamel"), (x, y, 0), yaw + rng.uniform(-3, 3), rng.uniform(0.96, 1.06)):
             plain = part.texture == "enamel" and part.tint == (1.0, 1.0, 1.0) and part.half[0] > 0.25
             painted = _painted(part, paint, offset) if plain else part
             shapes.append(replace(painted, thing=f"car {number}"))
         circles += [(x, y + dy, 1.0) for dy in (-1.0, 1.0)]
     for x, y in _TREES:
         x, y = x + rng.uniform(-0.3, 0.3), y + rng.uniform(-0.3, 0.3)
-        shapes += placed(_tree(rng), (x, y, 0), 0.0)
+        shapes += transformed(_tree(rng), (x, y, 0), 0.0)
         shapes.append(box((x, y, 0.04), (0.6, 0.6, 0.05), 20.0, "stone"))
         circles.append((x, y, 0.7))
     for x, y in ((-7.3, 4.4), (6.9, -4.2)):
         shapes += [
-            between((x, y, 0), (x, y, 3.6), 0.05, "asphalt"),
-            between((x, y, 3.6), (x - 0.5 * np.sign(x), y, 3.75), 0.04, "asphalt"),
+            capsule_between((x, y, 0), (x, y, 3.6), 0.05, "asphalt"),
+            capsule_between((x, y, 3.6), (x - 0.5 * np.sign(x), y, 3.75), 0.04, "asphalt"),
             Shape(ELLIPSOID, (x - 0.6 * np.sign(x), y, 3.72), (0.22, 0.13, 0.08), "enamel"),
         ]
         circles.append((x, y, 0.2))
@@ -145,10 +145,12 @@ def _standing(rng: np.random.Generator) -> tuple[list[Shape], list[Circle]]:
             box((x, y, 1.08), (0.31, 0.31, 0.04), 4.0 * k, "enamel", **bin_),
         ]
         circles.append((x, y, 0.4))
-    shapes += placed(parts_of("yard bench"), (-7.4, -4.6, 0), 75.0)
+    shapes += transformed(object_shapes("yard bench"), (-7.4, -4.6, 0), 75.0)
     circles.append((-7.4, -4.6, 0.85))
     for x, y in ((7.2, 0.6), (6.9, -2.3)):
-        shapes.append(between((x, y, 0), (x, y, 0.6), 0.4, "clay", CYLINDER, offset=tuple(rng.random(2))))
+        shapes.append(
+            capsule_between((x, y, 0), (x, y, 0.6), 0.4, "clay", CYLINDER, offset=tuple(rng.random(2)))
+        )
         for _ in range(6):
             at = np.array([x, y, 0.9]) + rng.uniform(-0.25, 0.25, 3)
             shapes.append(Shape(ELLIPSOID, vector(at), vector(rng.uniform(0.2, 0.36, 3)), "foliage"))

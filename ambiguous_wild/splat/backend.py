@@ -210,7 +210,7 @@ class GpuBackend(Backend):
         return bool(torch.isfinite(torch.stack([tensor.sum() for tensor in tensors])).all())
 
     def max_alpha(self, device: torch.device | str) -> float:
-        from ambiguous_wild.splat.gsplat_seam import max_alpha
+        from ambiguous_wild.splat.gsplat_calls import max_alpha
 
         return max_alpha(str(device))
 

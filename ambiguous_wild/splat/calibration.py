@@ -1,4 +1,4 @@
-"""What is done with kernels before a run: compile them once a machine, and time a fixed piece of training.
+"""Compile kernels before a run, once per machine, and time a fixed piece of training.
 
 The timed kernel, blending and Adam, tells how fast the machine is now. It runs the trainer's own code with
 the trainer's threads, so that other programs slow it down as they slow down a training. Its scene never
@@ -34,7 +34,7 @@ COLD_IN_SAMPLES = 53
 
 
 @dataclass(frozen=True)
-class Size:
+class KernelSize:
     """The work of a calibration kernel."""
 
     name: str  # name in the record of a run
@@ -50,13 +50,13 @@ class Size:
 # Reference machine of the CPU: 2 threads of an AMD EPYC virtual machine, nothing else running. That of a GPU
 # is nominal: the kernel takes a twentieth of a second there.
 KERNELS = {
-    "cpu": Size("cpu-3", 0.040, 12_000, 240, 136, 3, 2, 0.050),
-    "cuda": Size("gpu-3", 0.05, 100_000, 960, 544, 12),
+    "cpu": KernelSize("cpu-3", 0.040, 12_000, 240, 136, 3, 2, 0.050),
+    "cuda": KernelSize("gpu-3", 0.05, 100_000, 960, 544, 12),
 }
 
 
 @dataclass(frozen=True)
-class Reading:
+class CalibrationResult:
     """The result of one calibration.
 
     Load slows work on one thread less than work on several, so a training is compared with both.
@@ -71,7 +71,7 @@ class Reading:
 class Calibration:
     """The calibration kernel on one device."""
 
-    def __init__(self, device: torch.device, size: Size) -> None:
+    def __init__(self, device: torch.device, size: KernelSize) -> None:
         self.device, self.size = device, size
         rng = np.random.default_rng(7)
         xyz = rng.uniform([-4.0, -2.4, 4.0], [4.0, 2.4, 8.0], (size.gaussians, 3))
@@ -98,20 +98,20 @@ class Calibration:
         last.synchronize()
         return first.elapsed_time(last) / 1e3
 
-    def read(self) -> Reading:
+    def read(self) -> CalibrationResult:
         """Run the kernel with the threads of the training, and on a CPU on one thread too."""
         if self.device.type == "cuda":
-            return Reading(self.seconds())
+            return CalibrationResult(self.seconds())
         spent = time.process_time()
         seconds = self.seconds()
         processors = (time.process_time() - spent) / seconds
         if not self.size.serial_steps:
-            return Reading(seconds, processors)
+            return CalibrationResult(seconds, processors)
         begin, spent = time.perf_counter(), time.process_time()
         with one_thread():
             self._steps(self.size.serial_steps)
         serial_s = time.perf_counter() - begin
-        return Reading(seconds, processors, serial_s, (time.process_time() - spent) / serial_s)
+        return CalibrationResult(seconds, processors, serial_s, (time.process_time() - spent) / serial_s)
 
     def _steps(self, count: int) -> None:
         for k in range(count):

@@ -1,10 +1,10 @@
 """Photos of the training side, at every resolution of the schedule, on the device that trains.
 
-Photos that fit into `RESIDENT` of a GPU's free memory, or `FLOATS` of the machine's memory, stay there as
-float32 for the whole run. Others are held as the codes of their files, for 8 bits a quarter of the bytes: for
-a GPU in pinned memory of the host, for a CPU in `RESIDENT` of the memory, and what does not fit is read from
-its file again. The training loop announces the next view (`prefetch`); its photo is copied, converted or read
-while the step computes.
+Photos that fit into `RESIDENT_SHARE` of a GPU's free memory, or `FLOAT32_SHARE` of the machine's memory, stay
+there as float32 for the whole run. Others are held as the codes of their files, for 8 bits a quarter of the
+bytes: for a GPU in pinned memory of the host, for a CPU in `RESIDENT_SHARE` of the memory, and what does not
+fit is read from its file again. The training loop announces the next view (`prefetch`); its photo is copied,
+converted or read while the step computes.
 """
 
 from __future__ import annotations
@@ -26,9 +26,11 @@ from ambiguous_wild.io.images import as_float, load_image_codes, read_alpha, rea
 from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.splat.step import TrainData
 
-RESIDENT = 0.25  # share of the memory; Gaussians, their moments, masks and gsplat's lists need the rest
-FLOATS = 0.05  # share for float32 on a CPU; to convert the codes of 1600x1200 px takes 5 ms of another thread
-READY = 3  # photos on the device at a time: this step's, the next one's, and one for comparisons
+RESIDENT_SHARE = 0.25  # share of the memory; Gaussians, their moments, masks and gsplat's lists need the rest
+FLOAT32_SHARE = (
+    0.05  # share for float32 on a CPU; to convert the codes of 1600x1200 px takes 5 ms of another thread
+)
+PHOTOS_ON_DEVICE = 3  # photos on the device at a time: this step's, the next one's, and one for comparisons
 
 
 def load_train_data(
@@ -76,14 +78,20 @@ def load_train_data(
 
 
 def read_photos(files: Sequence[Path], cameras: Sequence[Camera], device: torch.device) -> Sequence[Tensor]:
-    """Photos [H, W, 3] float32 in [0, 1] on the device: a list, or `Photos` if they would fill its memory.
+    """Photos [H, W, 3] float32 in [0, 1] on the device: a list, or `PrefetchedPhotos` if memory is short.
 
     Raises:
         AwError: a photo differs in size from its camera.
     """
-    copies: Copies | None = None
-    if 12 * sum(camera.height * camera.width for camera in cameras) > room(device):  # 3 channels of 4 bytes
-        copies = CudaCopies(device) if device.type == "cuda" else HostReads(room(device, RESIDENT))
+    copies: PhotoTransfer | None = None
+    if 12 * sum(camera.height * camera.width for camera in cameras) > photo_memory(
+        device
+    ):  # 3 channels of 4 bytes
+        copies = (
+            CudaPhotoTransfer(device)
+            if device.type == "cuda"
+            else HostPhotoTransfer(photo_memory(device, RESIDENT_SHARE))
+        )
     held: list[Any] = []
     readers = photo_threads(max((camera.height * camera.width for camera in cameras), default=0))
     for file, camera, codes in zip(files, cameras, in_order(load_image_codes, files, readers), strict=True):
@@ -96,7 +104,7 @@ def read_photos(files: Sequence[Path], cameras: Sequence[Camera], device: torch.
             held.append(torch.from_numpy(as_float(codes)).to(device))
         else:
             held.append(copies.hold(file, codes))
-    return held if copies is None else Photos(held, device, copies)
+    return held if copies is None else PrefetchedPhotos(held, device, copies)
 
 
 def load_keep(
@@ -169,7 +177,7 @@ class KeepMaps(Sequence[Tensor | None]):
         return None if codes is None else codes.float()
 
 
-class Pyramid:
+class PhotoPyramid:
     """The train photos and cameras at every size; smaller photos are made when they are first asked for."""
 
     def __init__(self, data: TrainData) -> None:
@@ -204,7 +212,7 @@ class Pyramid:
         return self._cameras[view, factor]
 
 
-class Copies(Protocol):
+class PhotoTransfer(Protocol):
     """Brings photos to the device while a step runs."""
 
     def hold(self, file: Path, codes: np.ndarray) -> Any:
@@ -217,7 +225,7 @@ class Copies(Protocol):
         """Return the photo on the device, uint8 codes or float32; work launched later waits for it."""
 
 
-class HostReads:
+class HostPhotoTransfer:
     """Converts the codes of photos on another thread; those that do not fit are read from their files."""
 
     def __init__(self, room: float) -> None:
@@ -244,7 +252,7 @@ def _floats(held: np.ndarray | Path) -> np.ndarray:
     return as_float(load_image_codes(held) if isinstance(held, Path) else held)
 
 
-class CudaCopies:
+class CudaPhotoTransfer:
     """Sends tensors to a GPU on a separate stream, without making the host wait."""
 
     def __init__(self, device: torch.device) -> None:
@@ -271,10 +279,10 @@ class CudaCopies:
         return on_gpu
 
 
-class Photos(Sequence[Tensor]):
+class PrefetchedPhotos(Sequence[Tensor]):
     """Photos [H, W, 3] float32 in [0, 1], of which only a few lie in the device's memory at a time."""
 
-    def __init__(self, held: Sequence[Any], device: torch.device, copies: Copies) -> None:
+    def __init__(self, held: Sequence[Any], device: torch.device, copies: PhotoTransfer) -> None:
         """
         Args:
             held: what `copies` holds of each photo.
@@ -293,10 +301,10 @@ class Photos(Sequence[Tensor]):
     @overload
     def __getitem__(self, index: int) -> Tensor: ...
     @overload
-    def __getitem__(self, index: slice) -> Photos: ...
-    def __getitem__(self, index: int | slice) -> Tensor | Photos:
+    def __getitem__(self, index: slice) -> PrefetchedPhotos: ...
+    def __getitem__(self, index: int | slice) -> Tensor | PrefetchedPhotos:
         if isinstance(index, slice):
-            return Photos(self._held[index], self._device, self._copies)
+            return PrefetchedPhotos(self._held[index], self._device, self._copies)
         index = range(len(self._held))[index]
         photo = self._ready.pop(index, None)
         if photo is None:
@@ -304,26 +312,26 @@ class Photos(Sequence[Tensor]):
             photo = self._copies.finish(self._coming.pop(index))
             photo = photo if photo.dtype == torch.float32 else photo.float() / self._most
         self._ready[index] = photo  # at the end: read most recently
-        while len(self._ready) > READY:
+        while len(self._ready) > PHOTOS_ON_DEVICE:
             del self._ready[next(iter(self._ready))]
         return photo
 
     def prefetch(self, index: int) -> None:
         """Start to bring this photo, unless it is on the device or on its way."""
         if index not in self._ready and index not in self._coming:
-            while len(self._coming) >= READY:  # announced and never read
+            while len(self._coming) >= PHOTOS_ON_DEVICE:  # announced and never read
                 del self._coming[next(iter(self._coming))]
             self._coming[index] = self._copies.begin(self._held[index])
 
 
-def room(device: torch.device, share: float = FLOATS) -> float:
+def photo_memory(device: torch.device, share: float = FLOAT32_SHARE) -> float:
     """Return how many bytes of photos may stay in the device's memory for the whole run.
 
     Args:
-        device: of a GPU `RESIDENT` of its free memory counts.
+        device: of a GPU `RESIDENT_SHARE` of its free memory counts.
         share: of the machine's memory.
     """
     if device.type == "cuda":
-        return RESIDENT * torch.cuda.mem_get_info(device)[0]
+        return RESIDENT_SHARE * torch.cuda.mem_get_info(device)[0]
     memory = usable_memory()
     return math.inf if memory is None else share * memory

@@ -238,7 +238,7 @@ class DensityControl:
     def choose(self, step: Step, gaussians: Gaussians) -> Growth:
         """Choose the rows that grow in this round, at most `room` of them."""
         score = self.mean_gradient()
-        chosen = largest(score, score > self.config.grow_grad, self.room(step, gaussians))
+        chosen = top_k_mask(score, score > self.config.grow_grad, self.room(step, gaussians))
         return Growth.of(chosen, self.small(gaussians))
 
     def mean_gradient(self) -> Tensor:
@@ -275,7 +275,7 @@ class DensityControl:
     def _split_half(self, parents: Gaussians) -> Gaussians:
         """Draw one sample from each parent, 1.6 times smaller."""
         noise = torch.from_numpy(self.rng.standard_normal((len(parents), 3)).astype(np.float32))
-        parents.means += shaped(noise.to(parents.device), parents)
+        parents.means += covariance_offsets(noise.to(parents.device), parents)
         parents.log_scales -= float(np.log(1.6))
         return parents
 
@@ -330,8 +330,8 @@ class DensityControl:
         self.log.load_state_dict(state["log"])
 
 
-def largest(score: Tensor, chosen: Tensor, room: int) -> Tensor:
-    """Return those `room` of the chosen rows that have the largest score, [N] bool."""
+def top_k_mask(score: Tensor, chosen: Tensor, room: int) -> Tensor:
+    """Return the `room` chosen rows with the largest score, [N] bool."""
     if int(chosen.sum()) <= room:
         return chosen
     # stable sort: ties are broken by row, so the same seed gives the same set
@@ -343,7 +343,7 @@ def largest(score: Tensor, chosen: Tensor, room: int) -> Tensor:
     return kept
 
 
-def shaped(noise: Tensor, gaussians: Gaussians) -> Tensor:
-    """Turn normal draws [N, 3] into offsets from the means [N, 3] with the Gaussians' covariances."""
+def covariance_offsets(noise: Tensor, gaussians: Gaussians) -> Tensor:
+    """Transform normal draws [N, 3] to offsets [N, 3] with the Gaussians' covariances."""
     local = noise * gaussians.log_scales.exp()
     return (rotation_matrices(gaussians.quats) @ local[:, :, None]).squeeze(2)

@@ -1,4 +1,4 @@
-"""One call that draws as the run does: with its effects, fields, SH degree, background and filter."""
+"""Rendering with a run's effects, fields, SH degree, background and filter."""
 
 from __future__ import annotations
 
@@ -62,7 +62,9 @@ class SceneRenderer:
         """Draw the model; effects have already changed the view context's camera."""
         return self.effects.render(gaussians, context, self._compose, without)
 
-    def again(self, gaussians: Gaussians, context: ViewContext, without: Collection[str] = ()) -> Rendered:
+    def draw_again(
+        self, gaussians: Gaussians, context: ViewContext, without: Collection[str] = ()
+    ) -> Rendered:
         """Draw another picture of a step, see `Step.draw`."""
         if gaussians is self.static.gaussians:
             return self(gaussians, context, without)

@@ -82,7 +82,7 @@ class Field:
             self.density.load_state_dict(state["density"])
 
 
-def rates_with(attributes: Mapping[str, GaussianAttribute], rates: Rates) -> Rates:
+def rates_with_attributes(attributes: Mapping[str, GaussianAttribute], rates: Rates) -> Rates:
     """Return the learning rates of the parameters and of these attributes."""
     learnt = {name: a for name, a in attributes.items() if a.rate > 0}
     if not learnt:

@@ -19,7 +19,7 @@ from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.field import Rates
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import (
-    NOTHING,
+    NO_STATISTICS,
     Cotangents,
     Frame,
     Gradients,
@@ -122,13 +122,15 @@ class Composite:
         return self.renders[STATIC].radii
 
     @torch.no_grad()
-    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
+    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NO_STATISTICS) -> Gradients:
         """Return the gradients of the static field; those of the others are in `Gradients.fields`."""
         given = dict(self._vjp(as_cotangents(cotangents)))
         for name, more in self._own.items():
             given[name] = given[name] + more if name in given else more
         by_field = {
-            name: rendered.backward(given[name], needs if name == STATIC else self._needs.get(name, NOTHING))
+            name: rendered.backward(
+                given[name], needs if name == STATIC else self._needs.get(name, NO_STATISTICS)
+            )
             for name, rendered in self.renders.items()
             if name in given or name == STATIC
         }

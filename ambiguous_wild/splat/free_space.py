@@ -1,4 +1,4 @@
-"""SfM points in space that photos show to be free: of distractors, and of wrong matches.
+"""Free-space violations: SfM points of distractors and of wrong matches.
 
 A distractor that stands still in some photos has points like the static scene. Photos in which it is gone see
 through them: they show the surface behind, as other photos do. Training starts without such points.
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import Camera
 from ambiguous_wild.splat.effects.near_space import SHARE, nearest_depths
-from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, tracks_of
+from ambiguous_wild.splat.effects.tracks import TrackColours, log_gains, point_indices_by_photo
 from ambiguous_wild.splat.step import TrainData
 
 if TYPE_CHECKING:
@@ -29,14 +29,16 @@ AGREEING = 4  # a point stays if this many times as many photos show it, or its 
 IN_FRONT = 0.9  # share of the surface's depth below which a point is in front of it
 EDGE = 0.3  # share of the photo's longer side; triangles with longer edges say nothing of colours
 SAME = 0.06  # mean difference of colours in [0, 1] up to which two are the same
-NEIGHBOURS = 12  # nearest other train photos that are asked about a place: farther ones confirm too much
+NEIGHBOURS = 12  # nearest other train photos compared at a place: farther ones confirm too much
 CONFIRM, CONFIRM_SHARE = 2, 0.3  # of these, so many must show the colour, and this share
-APART = 0.015  # share of the longer side; a photo that has point and place closer together is not asked
+MIN_SEPARATION = (
+    0.015  # share of the longer side; a photo that has point and place closer together is skipped
+)
 PIXELS = 20_000  # of the reduced photos that colours are read from
 
 
 def free_space_violations(data: TrainData) -> np.ndarray:
-    """Return the SfM points [M] bool that lie in space which photos show to be free.
+    """Return which SfM points violate the free space of photos, [M] bool.
 
     The surface that a photo sees is the Delaunay triangulation of the points of long tracks that it observes.
     A point in front of it, which the photo does not observe, violates the photo's free space if
@@ -53,7 +55,7 @@ def free_space_violations(data: TrainData) -> np.ndarray:
     ]
     observed = [
         rows[camera.has(*camera.project(xyz[rows]))]
-        for camera, rows in zip(cameras, tracks_of(data.scene), strict=True)
+        for camera, rows in zip(cameras, point_indices_by_photo(data.scene), strict=True)
     ]
     length = np.bincount(np.concatenate([np.zeros(0, np.int64), *observed]), minlength=len(xyz))
     of_surface = [rows[length[rows] >= MIN_TRACK] for rows in observed]
@@ -74,8 +76,8 @@ def free_space_violations(data: TrainData) -> np.ndarray:
         triangle = surface.triangle(pixels[rows])
         least = surface.least_depth(triangle)
         shown = photos[view].at(pixels[rows])
-        asked = (z[rows] < IN_FRONT * least) & np.isfinite(shown).all(axis=1)
-        rows, triangle, least, shown = rows[asked], triangle[asked], least[asked], shown[asked]
+        in_front = (z[rows] < IN_FRONT * least) & np.isfinite(shown).all(axis=1)
+        rows, triangle, least, shown = rows[in_front], triangle[in_front], least[in_front], shown[in_front]
         near = (z[rows] < np.minimum(SHARE * least, depths[view])) & (length[rows] < MIN_TRACK)
         small = surface.longest_edge(triangle) < EDGE * max(camera.width, camera.height)
         agrees = _distance(shown, of_point[rows]) <= SAME
@@ -97,14 +99,14 @@ def _confirmed(
         behind: [N, 3] places on the surface.
         shown: [N, 3] colours there.
         points: [N, 3] points in front of them.
-        others: cameras and colours of the photos that are asked.
+        others: cameras and colours of the compared photos.
     """
     votes, answers = np.zeros((2, len(behind)), np.int64)
     for camera, photo in others:
         pixels, z = camera.project(behind)
         beside = np.linalg.norm(pixels - camera.project(points)[0], axis=1)
         # NaN: the point is behind the camera
-        tells = camera.has(pixels, z) & ~(beside <= APART * max(camera.width, camera.height))
+        tells = camera.has(pixels, z) & ~(beside <= MIN_SEPARATION * max(camera.width, camera.height))
         colours = photo.at(pixels[tells])
         answers[tells] += np.isfinite(colours).all(axis=1)
         votes[tells] += _distance(colours, shown[tells]) <= SAME

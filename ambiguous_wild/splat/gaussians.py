@@ -122,8 +122,8 @@ class Gaussians:
         """Copy the rows of a bool mask [N] or an index tensor; the copy is up to date."""
         return self._each(lambda name, tensor: tensor[rows].contiguous())
 
-    def of_degree(self, degree: int) -> Gaussians:
-        """These with harmonics up to this degree: higher ones are dropped, missing ones are 0."""
+    def with_sh_degree(self, degree: int) -> Gaussians:
+        """Return a copy with this SH degree: higher harmonics are dropped, missing ones are 0."""
         rest = (degree + 1) ** 2 - 1
         padding = (0, 0, 0, rest - self.sh_rest.shape[1])  # negative: cuts
         return replace(self, sh_rest=torch.nn.functional.pad(self.sh_rest, padding).contiguous())
@@ -149,8 +149,8 @@ class Gaussians:
         """Return a copy whose `sh_rest` is up to date."""
         return self._each(lambda name, tensor: tensor.clone())
 
-    def carrying(self, attributes: Mapping[str, Tensor]) -> Gaussians:
-        """Return the same Gaussians with these further attributes."""
+    def with_attributes(self, attributes: Mapping[str, Tensor]) -> Gaussians:
+        """Return the Gaussians with further attributes."""
         return replace(self, attributes={**self.attributes, **attributes})
 
     def _each(self, change: Callable[[str, Tensor], Tensor]) -> Gaussians:

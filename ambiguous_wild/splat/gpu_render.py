@@ -17,14 +17,13 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core import AwError, Camera
-from ambiguous_wild.splat import gsplat_seam as seam
-from ambiguous_wild.splat import readiness
+from ambiguous_wild.splat import gsplat_calls, readiness
 from ambiguous_wild.splat.effects.device_cameras import on_device
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
 from ambiguous_wild.splat.gpu_kernels import visible
 from ambiguous_wild.splat.rendered import (
     GSPLAT_SUMS,
-    NOTHING,
+    NO_STATISTICS,
     Cotangents,
     Gradients,
     Shade,
@@ -54,9 +53,9 @@ class RenderedCuda:
     def __init__(
         self,
         leaves: dict[str, Tensor],
-        splats: seam.ProjectedGaussians,
+        splats: gsplat_calls.ProjectedGaussians,
         colours: Tensor,
-        tiles: seam.Tiles,
+        tiles: gsplat_calls.Tiles,
         background: Tensor,
         size: tuple[int, int],
         shaded: Shaded | None = None,
@@ -78,7 +77,7 @@ class RenderedCuda:
         self._image, self._alpha, _ = self._blend(self._cut)
         self._depth: Tensor | None = None
         self.image, self.alpha = self._image.detach(), self._alpha.detach()
-        size_px = seam.size_on(*size, splats.radii.device)
+        size_px = gsplat_calls.size_on(*size, splats.radii.device)
         self.visible = visible(splats.radii, splats.means2d, splats.conics, splats.opacities, size_px)
         self._shown = splats.radii
 
@@ -93,14 +92,14 @@ class RenderedCuda:
         if self._depth is None:
             with torch.no_grad():
                 s = self._splats
-                picture, _, _ = seam.blend(
+                picture, _, _ = gsplat_calls.blend(
                     s.means2d, s.conics, s.depths[:, None], s.opacities, self._tiles, *self._size
                 )
             self._depth = picture[..., 0]
         return self._depth
 
     @torch.no_grad()
-    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
+    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NO_STATISTICS) -> Gradients:
         """Do as `Rendered.backward`, but only once for a picture, because torch frees its graph.
 
         Absolute sums do not contain depth, which gsplat blends separately.
@@ -127,7 +126,7 @@ class RenderedCuda:
                 d_image = torch.zeros_like(self.image)
         at_cut = _vjp(image, alpha, cut, d_image, cotangent.alpha, keep=d_extra is not None)
         screen = at_cut[0]
-        screen_abs = None if batch is None else seam.absolute_gradient(batch)
+        screen_abs = None if batch is None else gsplat_calls.absolute_gradient(batch)
         depths = None
         if cotangent.depth is not None:
             *through, depths = self._depth_gradients(cotangent.depth)
@@ -171,7 +170,7 @@ class RenderedCuda:
 
     def _blend(self, cut: list[Tensor], *, absolute: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         means2d, conics, colours, opacities = cut
-        return seam.blend(
+        return gsplat_calls.blend(
             means2d, conics, colours, opacities, self._tiles, *self._size,
             background=self._background, absolute=absolute,
         )  # fmt: skip
@@ -181,7 +180,7 @@ class RenderedCuda:
         s = self._splats
         leaves = [v.detach().requires_grad_(True) for v in (s.means2d, s.conics, s.opacities, s.depths)]
         with torch.enable_grad():
-            picture, _, _ = seam.blend(
+            picture, _, _ = gsplat_calls.blend(
                 leaves[0], leaves[1], leaves[3][:, None], leaves[2], self._tiles, *self._size
             )
         return torch.autograd.grad(picture, leaves, d_depth[..., None])
@@ -194,7 +193,7 @@ def render_cuda(
     sh_degree: int,
     background: tuple[float, float, float],
     antialias: bool,
-    blur: float = seam.BLUR,
+    blur: float = gsplat_calls.BLUR,
     shade: Shade | None = None,
 ) -> RenderedCuda:
     """Render on the GPU; see `render.render`. `shade` gets all rows; those that are not visible are 0.
@@ -202,13 +201,13 @@ def render_cuda(
     Raises:
         AwError: gsplat is missing or cannot be used; the message holds the command that mends it.
     """
-    seam.gsplat()
+    gsplat_calls.gsplat()
     if gaussians.device.type == "cuda":
         _check_gpu()
     cam = on_device(camera, gaussians.device)
     graph = torch.is_grad_enabled()
     leaves = {name: tensor.detach().requires_grad_(graph) for name, tensor in gaussians.items()}
-    splats = seam.project(
+    splats = gsplat_calls.project(
         leaves["means"],
         leaves["quats"],
         leaves["log_scales"].exp(),
@@ -224,18 +223,18 @@ def render_cuda(
     shaded = None if shade is None else _shaded(shade, gaussians, base, splats)
     colours = (base if shaded is None else shaded.colours).clamp(min=0.0)
     size = (camera.width, camera.height)
-    tiles = seam.sort(splats, *size)
+    tiles = gsplat_calls.sort(splats, *size)
     behind = _background_on(background, gaussians.device)
     return RenderedCuda(leaves, splats, colours, tiles, behind, size, shaded)
 
 
 @functools.cache
 def _check_gpu() -> None:
-    readiness.require(readiness.look())
+    readiness.require_gpu(readiness.gpu_facts())
 
 
 def _base_colours(
-    leaves: dict[str, Tensor], splats: seam.ProjectedGaussians, centre: Tensor, degree: int
+    leaves: dict[str, Tensor], splats: gsplat_calls.ProjectedGaussians, centre: Tensor, degree: int
 ) -> Tensor:
     """Return SH + 0.5 [N, 3], not clamped; rows that are not visible may hold any value."""
     if degree == 0:
@@ -243,10 +242,12 @@ def _base_colours(
     active = leaves["sh_rest"][:, : (degree + 1) ** 2 - 1]
     coefficients = torch.cat([leaves["sh0"][:, None], active], dim=1)
     drawn = (splats.radii > 0).all(dim=1)
-    return seam.shade(degree, leaves["means"], centre, coefficients, drawn) + 0.5
+    return gsplat_calls.shade(degree, leaves["means"], centre, coefficients, drawn) + 0.5
 
 
-def _shaded(shade: Shade, gaussians: Gaussians, base: Tensor, splats: seam.ProjectedGaussians) -> Shaded:
+def _shaded(
+    shade: Shade, gaussians: Gaussians, base: Tensor, splats: gsplat_calls.ProjectedGaussians
+) -> Shaded:
     """Call the shading function.
 
     Raises:

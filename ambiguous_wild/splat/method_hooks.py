@@ -72,16 +72,16 @@ class RenderLeaves:
         Raises:
             AwError: it is not one number, or does not depend on them.
         """
-        leaves, found = list(self._leaves.values()), tuple[Tensor | None, ...]()
+        leaves, gradients = list(self._leaves.values()), tuple[Tensor | None, ...]()
         if isinstance(loss, Tensor) and loss.numel() == 1 and loss.requires_grad and leaves:
-            found = torch.autograd.grad(loss.reshape(()), leaves, allow_unused=True)
-        if all(gradient is None for gradient in found):
+            gradients = torch.autograd.grad(loss.reshape(()), leaves, allow_unused=True)
+        if all(gradient is None for gradient in gradients):
             what = f"a tensor {list(loss.shape)}" if isinstance(loss, Tensor) else f"a {type(loss).__name__}"
             raise AwError(
                 f"loss(render, step, keep) of {owner} gave {what}; it must give one number (a mean) computed "
                 "from render.image, render.alpha or render.depth, not from step.rendered (docs/extend.md)"
             )
-        by_name = dict(zip(self._leaves, found))
+        by_name = dict(zip(self._leaves, gradients))
         return Cotangents(by_name.get("image"), None, by_name.get("alpha"), by_name.get("depth"))
 
 
@@ -219,7 +219,7 @@ class MethodHooks:
     start_opacity: float = 0.1
     start_scale: float = 1.0  # times the start size of 3DGS
     # what the user gives to start from: Gaussians, or points [M, 3] with colours [M, 3] uint8
-    given: Gaussians | tuple[np.ndarray, np.ndarray] | None = None
+    user_start: Gaussians | tuple[np.ndarray, np.ndarray] | None = None
     # the first Gaussians; None = one at every point of the sparse model (without those of
     # `free_space_violations`) and of `more_points`
     start: Callable[[TrainData], Gaussians] | None = None
@@ -230,8 +230,8 @@ class MethodHooks:
     train_data: Callable[[TrainData], TrainData] | None = None
     effects: tuple[Effect, ...] = ()  # see effects/; of those that are not listed no code is reached
 
-    def suited_to(self, effect: Effect) -> MethodHooks:
-        """Return the method changed as an added effect needs: with its start points and 2D filter."""
+    def with_effect(self, effect: Effect) -> MethodHooks:
+        """Return the method with the start points and the 2D filter of an added effect."""
         more = (effect.first_points,) if effect.acts("first_points") else ()
         return replace(
             self, more_points=(*self.more_points, *more), antialias=self.antialias or effect.antialias
@@ -248,18 +248,18 @@ class MethodHooks:
         Raises:
             AwError: fewer than 4 points.
         """
-        if isinstance(self.given, Gaussians):
-            rows = torch.from_numpy(thinned(len(self.given), most))
-            return self.given.select(rows).of_degree(self.sh_degree).to(data.device)
-        if self.start is not None and self.given is None:
+        if isinstance(self.user_start, Gaussians):
+            rows = torch.from_numpy(start_rows(len(self.user_start), most))
+            return self.user_start.select(rows).with_sh_degree(self.sh_degree).to(data.device)
+        if self.start is not None and self.user_start is None:
             return self.start(data)
-        if self.given is None:
+        if self.user_start is None:
             sparse, out = data.scene.points, free_space_violations(data)
             xyz, rgb = sparse.xyz[~out], sparse.rgb[~out]
             LOG.debug("%d of %d sparse points left out: in the free space of photos", out.sum(), len(out))
         else:
-            xyz, rgb = self.given
-        kept = thinned(len(xyz), most)
+            xyz, rgb = self.user_start
+        kept = start_rows(len(xyz), most)
         xyz, rgb = xyz[kept], rgb[kept]
         for points in self.more_points if len(xyz) >= MIN_POINTS else ():  # fewer are refused below
             room = int(START_SHARE * most) - len(xyz)
@@ -317,8 +317,8 @@ def check_cotangents(value: object, step: Step) -> None:
         )
 
 
-def thinned(count: int, most: int) -> np.ndarray:
-    """Return the rows of `count` points that a run of at most `most` Gaussians starts from; 0 = all."""
+def start_rows(count: int, most: int) -> np.ndarray:
+    """Return the rows of `count` points that a run starts from, for at most `most` Gaussians; 0 = all."""
     if not most or count <= most:
         return np.arange(count)
     # chosen at random: points of a scan have no tracks that would show which of them matter

@@ -1,7 +1,7 @@
 """Whether torch and gsplat can use this machine's GPU; if not, what is missing and the command that helps.
 
-`look` collects the facts, functions without side effects judge them, and `load_kernels` draws one Gaussian.
-Only `torch_facts` imports torch, so that `aw doctor` can call it in another process.
+`gpu_facts` collects the facts, functions without side effects judge them, and `load_kernels` draws one
+Gaussian. Only `torch_facts` imports torch, so that `aw doctor` can call it in another process.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from typing import TypedDict
 from ambiguous_wild.core.errors import AwError, install_command, installed, torch_command
 from ambiguous_wild.io.files import patient_lock
 
-GSPLAT = "1.5.3"  # the release that gsplat_seam.py is written for
+GSPLAT = "1.5.3"  # the release that gsplat_calls.py is written for
 INSTALL_GSPLAT = f"{sys.executable} -m pip install 'gsplat=={GSPLAT}'"
 TOOLKIT = "https://developer.nvidia.com/cuda-toolkit-archive"
 COMPILE_S = 3600.0  # longest wait for another process that compiles gsplat's kernels, seconds
 
 
 @dataclass(frozen=True)
-class Lack:
+class MissingDependency:
     """A missing dependency of training on the GPU."""
 
     what: str
@@ -88,7 +88,7 @@ def torch_facts() -> TorchFacts:
     }
 
 
-def look(torch: TorchFacts | None = None) -> GpuFacts:
+def gpu_facts(torch: TorchFacts | None = None) -> GpuFacts:
     """Collect the facts about this machine.
 
     Args:
@@ -98,7 +98,7 @@ def look(torch: TorchFacts | None = None) -> GpuFacts:
     package = None if spec is None or spec.origin is None else Path(spec.origin).parent
     return GpuFacts(
         torch=torch_facts() if torch is None else torch,
-        driver=first_line("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"),
+        driver=first_output_line("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"),
         gsplat=installed("gsplat"),
         prebuilt=package is not None and any(package.glob("csrc*.so")),
         compiler=shutil.which(os.environ.get("CXX", "c++")),
@@ -106,38 +106,48 @@ def look(torch: TorchFacts | None = None) -> GpuFacts:
     )
 
 
-def why_not(facts: GpuFacts) -> Lack | None:
+def missing_dependency(facts: GpuFacts) -> MissingDependency | None:
     """Return the first missing dependency of training on the GPU; None if nothing is missing."""
-    return no_cuda(facts) or no_gsplat(facts) or no_compiler(facts)
+    return cuda_problem(facts) or gsplat_problem(facts) or compiler_problem(facts)
 
 
-def no_cuda(facts: GpuFacts) -> Lack | None:
+def cuda_problem(facts: GpuFacts) -> MissingDependency | None:
     """Return why torch cannot compute on the GPU; None if it can."""
     torch = facts.torch
     if torch["cuda"]:
         return None
     if torch["built"] is None:
         what = f"torch {torch['version']} is a CPU build"
-        return Lack(what, torch_command(torch["version"]) if facts.driver else "nothing to do without a GPU")
+        return MissingDependency(
+            what, torch_command(torch["version"]) if facts.driver else "nothing to do without a GPU"
+        )
     what = f"torch {torch['version']} is built for CUDA {torch['built']}, but sees no GPU"
     if facts.driver is None:
-        return Lack(f"{what}, and no NVIDIA driver answers", "install the driver, see that nvidia-smi works")
+        return MissingDependency(
+            f"{what}, and no NVIDIA driver answers", "install the driver, see that nvidia-smi works"
+        )
     if facts.hidden is not None and facts.hidden.strip() in ("", "-1"):
-        return Lack(f"{what}: CUDA_VISIBLE_DEVICES={facts.hidden!r} hides it", "unset CUDA_VISIBLE_DEVICES")
+        return MissingDependency(
+            f"{what}: CUDA_VISIBLE_DEVICES={facts.hidden!r} hides it", "unset CUDA_VISIBLE_DEVICES"
+        )
     why = f" ({torch['error']})" if torch["error"] else ""
-    return Lack(f"{what}; the driver has {facts.driver}{why}", "install a newer driver, then restart")
+    return MissingDependency(
+        f"{what}; the driver has {facts.driver}{why}", "install a newer driver, then restart"
+    )
 
 
-def no_gsplat(facts: GpuFacts) -> Lack | None:
+def gsplat_problem(facts: GpuFacts) -> MissingDependency | None:
     """Return why gsplat cannot be called; None if it can."""
     if facts.gsplat is None:
-        return Lack("gsplat is not installed", install_command("cuda"))
+        return MissingDependency("gsplat is not installed", install_command("cuda"))
     if facts.gsplat.partition("+")[0] != GSPLAT:
-        return Lack(f"gsplat {facts.gsplat} is installed, and {GSPLAT} is needed", INSTALL_GSPLAT)
+        return MissingDependency(
+            f"gsplat {facts.gsplat} is installed, and {GSPLAT} is needed", INSTALL_GSPLAT
+        )
     return None
 
 
-def no_compiler(facts: GpuFacts) -> Lack | None:
+def compiler_problem(facts: GpuFacts) -> MissingDependency | None:
     """Return what gsplat lacks to compile or load its kernels (to load them it needs nvcc too)."""
     if facts.prebuilt:
         return None
@@ -150,7 +160,7 @@ def no_compiler(facts: GpuFacts) -> Lack | None:
     if not wanted:
         return None
     names = " and ".join(text.partition(" (")[0] for text in wanted)
-    return Lack(
+    return MissingDependency(
         f"gsplat needs {names} to compile its kernels, and there is none", "install " + "; ".join(wanted)
     )
 
@@ -165,7 +175,7 @@ def load_kernels() -> None:
     """
     from torch.utils.cpp_extension import get_default_build_root
 
-    from ambiguous_wild.splat.gsplat_seam import max_alpha
+    from ambiguous_wild.splat.gsplat_calls import max_alpha
 
     own = str(Path(sys.executable).parent)  # pip installs ninja here, activated or not
     if own not in (path := os.environ.get("PATH", "")).split(os.pathsep):
@@ -182,19 +192,21 @@ def load_kernels() -> None:
             ) from error
 
 
-def require(facts: GpuFacts) -> None:
+def require_gpu(facts: GpuFacts) -> None:
     """Make sure that gsplat can draw on this machine's GPU.
 
     Raises:
         AwError: something is missing; the message holds the command that installs it.
     """
-    lack = why_not(facts)
+    lack = missing_dependency(facts)
     if lack is not None:
         raise AwError(str(lack))
     load_kernels()
 
 
-def choose(device: str, say: Callable[[str], None], *, looking: Callable[[], GpuFacts] | None = None) -> str:
+def choose_device(
+    device: str, say: Callable[[str], None], *, collect_facts: Callable[[], GpuFacts] | None = None
+) -> str:
     """Return "cpu" or "cuda" for "auto", "cpu" or "cuda"; warns through `say` if a GPU stays unused.
 
     Raises:
@@ -202,9 +214,9 @@ def choose(device: str, say: Callable[[str], None], *, looking: Callable[[], Gpu
     """
     if device == "cpu":
         return "cpu"
-    facts = (looking or look)()
+    facts = (collect_facts or gpu_facts)()
     try:
-        require(facts)
+        require_gpu(facts)
         return "cuda"
     except AwError as error:
         problem = str(error)
@@ -215,7 +227,7 @@ def choose(device: str, say: Callable[[str], None], *, looking: Callable[[], Gpu
     return "cpu"
 
 
-def first_line(*words: str) -> str | None:
+def first_output_line(*words: str) -> str | None:
     """Return the first line that a program prints; None if the program is missing or fails."""
     if shutil.which(words[0]) is None:
         return None

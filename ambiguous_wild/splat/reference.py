@@ -1,4 +1,4 @@
-"""The judge: renderer and loss in plain float64 torch, every pixel against every Gaussian, by autograd.
+"""Reference renderer and loss in float64 torch, every pixel against every Gaussian, by autograd.
 
 It is slow on purpose: nothing is tiled, approximated or differentiated by hand. It has the conventions of
 `render.render`; tests measure both back ends against it.

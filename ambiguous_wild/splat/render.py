@@ -29,7 +29,7 @@ def render(
     """Render the Gaussians for one camera on the device they live on.
 
     Conventions of both back ends: near plane 0.01, alpha clamped at 0.99 (at 0.999 by gsplat
-    1.5.3, see gsplat_seam.py), alpha below 1/255 skipped, a pixel stops before transmittance
+    1.5.3, see gsplat_calls.py), alpha below 1/255 skipped, a pixel stops before transmittance
     reaches 1e-4, colours max(SH + 0.5, 0).
 
     Raises:

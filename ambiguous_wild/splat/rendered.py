@@ -24,7 +24,7 @@ EffectGrads = Mapping[str, Mapping[str, Tensor]]
 # Statistics that density control can ask for beyond the signed sums, see `Gradients`.
 NEEDS = ("absolute", "squared", "count")
 GSPLAT_SUMS = ("absolute",)  # those that gsplat offers
-NOTHING: frozenset[str] = frozenset()
+NO_STATISTICS: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Cotangents:
         return frozenset(name for name in _PICTURES if getattr(self, name) is not None)
 
     def __add__(self, other: Cotangents) -> Cotangents:
-        sums = {name: sum_where(getattr(self, name), getattr(other, name)) for name in _PICTURES}
+        sums = {name: sum_optional(getattr(self, name), getattr(other, name)) for name in _PICTURES}
         return Cotangents(**sums, effect_grads=sum_effect_grads(self.effect_grads, other.effect_grads))
 
 
@@ -86,7 +86,9 @@ class Gradients:
     def __add__(self, other: Gradients) -> Gradients:
         """Return the gradients of the sum of two losses, for the same Gaussians and camera."""
         plain = {f.name for f in fields(self)} - {"visible", "attributes", "effect_grads", "fields"}
-        sums: dict[str, Any] = {name: sum_where(getattr(self, name), getattr(other, name)) for name in plain}
+        sums: dict[str, Any] = {
+            name: sum_optional(getattr(self, name), getattr(other, name)) for name in plain
+        }
         seen = [g.visible for g in (self, other) if g.visible is not None]
         shared = self.fields.keys() & other.fields.keys()
         return Gradients(
@@ -137,7 +139,7 @@ class Rendered(Protocol):
         """[H, W] float32, sum of weight times z; divide by alpha for the expected depth."""
         ...
 
-    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
+    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NO_STATISTICS) -> Gradients:
         """Return the gradients of sum(cotangent * picture) with respect to every raw parameter.
 
         Args:
@@ -219,7 +221,7 @@ def sum_named(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Mapping[str, 
     return {name: a[name] + b[name] if name in a and name in b else {**a, **b}[name] for name in {**a, **b}}
 
 
-def sum_where(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+def sum_optional(a: Tensor | None, b: Tensor | None) -> Tensor | None:
     """Return the sum, where None is zero."""
     if a is None or b is None:
         return a if b is None else b

@@ -1,4 +1,4 @@
-"""What a part of the training loop is given: the training side of the scene, a view context, and one step."""
+"""Arguments of the training loop's parts: the training side of the scene, a view context, one step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run is asked for: its length, its resolution, and what it does at a fault. Imports no torch."""
+"""Length and resolution of a run, and what it does at a value that is not finite. Imports no torch."""
 
 from __future__ import annotations
 

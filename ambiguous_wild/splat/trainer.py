@@ -18,16 +18,15 @@ from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.core.config import State
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.calibration import warm_backward
-from ambiguous_wild.splat.data import Pyramid, shrink_keep
+from ambiguous_wild.splat.data import PhotoPyramid, shrink_keep
 from ambiguous_wild.splat.density import DensityControl
 from ambiguous_wild.splat.drawing import SceneRenderer
 from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
-from ambiguous_wild.splat.field import Field, rates_with
+from ambiguous_wild.splat.field import Field, rates_with_attributes
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import PhotometricLoss, photometric
 from ambiguous_wild.splat.method_hooks import MethodHooks, check_cotangents, check_keep
 from ambiguous_wild.splat.optim import SplatAdam
-from ambiguous_wild.splat.pace import Pace
 from ambiguous_wild.splat.rendered import (
     Cotangents,
     Gradients,
@@ -36,6 +35,7 @@ from ambiguous_wild.splat.rendered import (
     check_needs,
     with_visible,
 )
+from ambiguous_wild.splat.run_schedule import RunSchedule
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 from ambiguous_wild.splat.train_config import NOMINAL_ITERATIONS, TrainConfig
 from ambiguous_wild.splat.training_records import Clock, RunObserver, Timeline, clock_for
@@ -84,7 +84,7 @@ class Trainer:
         if any(data.scene.background):
             hooks = replace(hooks, background=data.scene.background)
         self.hooks = hooks
-        self.pyramid = Pyramid(data)
+        self.pyramid = PhotoPyramid(data)
         self._compiled: set[frozenset[str]] = set()  # cotangents for which the backward pass is compiled
         self._downsampling: dict[int, int] = {}  # factors of the steps since the device's check was last read
         # where reading a value makes the host wait, checks stay on the device and are read later
@@ -95,19 +95,21 @@ class Trainer:
         if needed and needed not in {effect.name for effect in hooks.effects}:
             raise AwError(f"this method's density control needs the effect {needed}: add --effects {needed}")
         most = hooks.density_config.max_gaussians
-        room = Pace(config, hooks.schedule, data, start=0, most=most).most
+        room = RunSchedule(config, hooks.schedule, data, start=0, most=most).max_gaussians
         gaussians = hooks.first_gaussians(data, room)
-        self.pace = Pace(config, hooks.schedule, data, start=len(gaussians), most=most)
-        sizes = self.pyramid.sizes(self.pace.factors)
+        self.run_schedule = RunSchedule(config, hooks.schedule, data, start=len(gaussians), most=most)
+        sizes = self.pyramid.sizes(self.run_schedule.factors)
         data.backend.prepare_loss(data.device, sizes, hooks.lambda_dssim, hooks.weighting)
         self.effects = EffectPipeline(hooks.effects, data)
         attributes = self.effects.rows(gaussians)
         if attributes:
-            gaussians = gaussians.carrying({name: a.values for name, a in attributes.items()})
+            gaussians = gaussians.with_attributes({name: a.values for name, a in attributes.items()})
         density = hooks.density(hooks.density_config, data.scene.extent, config.seed)
         density.setup(data)
         density.protected = self.effects.protected()
-        self.field = Field(gaussians, rates_with(attributes, self.pace.learning_rates), density)
+        self.field = Field(
+            gaussians, rates_with_attributes(attributes, self.run_schedule.learning_rates), density
+        )
         self.drawing = SceneRenderer(data, hooks, self.field, self.effects)
         hooks.mask.setup(data)
 
@@ -287,7 +289,7 @@ class Trainer:
     def make_step(self, iteration: int, view: int, downsampling: int | None = None) -> Step:
         """Draw a train view as the loop does; also used to predict masks after the training."""
         progress = self.progress(iteration)
-        downsampling = self.pace.downsampling(progress) if downsampling is None else downsampling
+        downsampling = self.run_schedule.downsampling(progress) if downsampling is None else downsampling
         context = ViewContext(
             iteration=iteration,
             nominal=progress * NOMINAL_ITERATIONS,
@@ -303,10 +305,10 @@ class Trainer:
         of_context = {f.name: getattr(context, f.name) for f in fields(ViewContext)}
         return Step(
             **of_context,
-            growth_cap=self.pace.ceiling(downsampling, progress),
+            growth_cap=self.run_schedule.growth_cap(downsampling, progress),
             rendered=rendered,
             gaussians=self.gaussians,
-            drawer=self.drawing.again,
+            drawer=self.drawing.draw_again,
         )
 
     def _photometric(self, step: Step, keep: Tensor | None) -> PhotometricLoss:
@@ -345,13 +347,13 @@ class Trainer:
         """
         iteration = self.iteration + 1
         part = self.clock.part
-        view = self.pace.view(iteration)
-        if self.watchdog.skips(self.pace.epoch(iteration), view):
+        view = self.run_schedule.view(iteration)
+        if self.watchdog.skips(self.run_schedule.epoch(iteration), view):
             self.iteration = iteration
             return math.nan
         step = self.make_step(iteration, view)
         if self.pyramid.prefetch is not None:
-            self.pyramid.prefetch(self.pace.view(iteration + 1))
+            self.pyramid.prefetch(self.run_schedule.view(iteration + 1))
         shown = (step.photo, step.rendered.image)
         changes = [picture._version for picture in shown]  # torch counts changes in place
         with part("mask"):
@@ -462,7 +464,7 @@ class Trainer:
         if broken is None:
             return
         # repeat at the step's own size: under a budget the schedule has moved on with the clock
-        view, downsampling = self.pace.view(broken.iteration), factors.get(broken.iteration)
+        view, downsampling = self.run_schedule.view(broken.iteration), factors.get(broken.iteration)
         step = self.make_step(broken.iteration, view, downsampling)
         keep = broken.keep
         loss = self._photometric(step, keep)
@@ -474,7 +476,7 @@ class Trainer:
     def check_parameters(self) -> None:
         """Raise NonFinite for the last step if a parameter is not finite."""
         self._read_device_check()
-        view = self.pace.view(max(self.iteration, 1))
+        view = self.run_schedule.view(max(self.iteration, 1))
         for field in (self.field, *self.drawing.others.values()):
             self.watchdog.check_parameters(self.iteration, view, field.gaussians)
 

@@ -23,7 +23,7 @@ class Stopped(KeyboardInterrupt):
 
 
 @contextmanager
-def deferred() -> Iterator[Callable[[], bool]]:
+def defer_interrupt() -> Iterator[Callable[[], bool]]:
     """Defer Ctrl-C inside of the context; yields a function that tells whether it was pressed.
 
     A second Ctrl-C interrupts at once. Outside of the main thread, or if another handler is installed for the
@@ -67,7 +67,7 @@ def train(trainer: Trainer, tick: Tick | None = None) -> None:
         meter.begin(trainer.clock.now())
     last_save = time.monotonic()
     try:
-        with deferred() as interrupted:
+        with defer_interrupt() as interrupted:
             while not (trainer.done and _save_if_finite(trainer)):
                 if trainer.done:
                     continue  # the run was rolled back, and its last checkpoint is checked
@@ -110,13 +110,13 @@ def advance(trainer: Trainer, tick: Tick | None = None) -> None:
     if tick is not None:
         tick(trainer)
     if meter is not None and calibrating:
-        meter.look(trainer.clock.now())
+        meter.calibrate(trainer.clock.now())
 
 
 def _marks(trainer: Trainer) -> tuple[int, int]:
     """Return how many probes and timeline rows are due since the start of the run."""
     now = (trainer.iteration, trainer.clock.now())
-    return trainer.pace.marks(trainer.config.probes, *now), trainer.pace.marks(ROWS, *now)
+    return trainer.run_schedule.marks(trainer.config.probes, *now), trainer.run_schedule.marks(ROWS, *now)
 
 
 def _save_if_finite(trainer: Trainer) -> bool:
@@ -139,11 +139,11 @@ def _roll_back(trainer: Trainer, error: NonFinite) -> None:
     watchdog = trainer.watchdog
     where = watchdog.snapshot(trainer.checkpoint_path, error)
     if not watchdog.rolls_back:
-        raise watchdog.final(error, where)
+        raise watchdog.final_error(error, where)
     spent, rollbacks = trainer.clock, list(watchdog.rollbacks)
     trainer.resume()
     trainer.clock = spent
-    epoch = trainer.pace.epoch(error.finding.iteration)
+    epoch = trainer.run_schedule.epoch(error.finding.iteration)
     watchdog.note_rollback(error, rollbacks, epoch=epoch, iteration=trainer.iteration)
     trainer.save()
 

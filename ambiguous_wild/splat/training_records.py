@@ -1,4 +1,4 @@
-"""What a run records: training time, the timeline, and where density control added and merged Gaussians."""
+"""Records of a run: training time, timeline, positions of added and merged Gaussians."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class RunObserver(Protocol):
 
     def due(self, trained_s: float, progress: float) -> bool: ...
 
-    def look(self, trained_s: float) -> None: ...
+    def calibrate(self, trained_s: float) -> None: ...
 
     def end(self) -> None: ...
 

@@ -68,11 +68,11 @@ class NonFiniteFinding:
 
 
 class NonFinite(AwError):
-    """Training met a value that is not a finite number; `seen` holds what the step saw."""
+    """Training met a value that is not a finite number; `tensors` holds those of the step."""
 
-    def __init__(self, finding: NonFiniteFinding, view: int, seen: State, message: str = "") -> None:
+    def __init__(self, finding: NonFiniteFinding, view: int, tensors: State, message: str = "") -> None:
         super().__init__(message or str(finding))
-        self.finding, self.view, self.seen = finding, view, seen
+        self.finding, self.view, self.tensors = finding, view, tensors
 
 
 class Watchdog:
@@ -95,7 +95,7 @@ class Watchdog:
     def check_loss(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> None:
         """Raise NonFinite if the loss of this step is not finite."""
         if not math.isfinite(float(loss.value)):
-            raise self._found("loss", step.iteration, step.view, {}, _seen(step, keep, loss))
+            raise self._finding("loss", step.iteration, step.view, {}, _seen(step, keep, loss))
 
     def check_gradients(
         self, step: Step, keep: Tensor | None, loss: PhotometricLoss, gradients: Gradients
@@ -109,7 +109,7 @@ class Watchdog:
         others = [name for name, d in _of_others(gradients) if not bool(torch.isfinite(d).all())]
         if bad or others:
             seen = _seen(step, keep, loss) | {f"d_{name}": named[name] for name in bad}
-            raise self._found("gradient", step.iteration, step.view, bad, seen, others)
+            raise self._finding("gradient", step.iteration, step.view, bad, seen, others)
 
     def checked_gradients(self, gradients: Gradients) -> list[Tensor]:
         """Return the gradients that are checked in every step."""
@@ -117,7 +117,7 @@ class Watchdog:
 
     def nonreproducible(self, step: Step, keep: Tensor | None, loss: PhotometricLoss) -> NonFinite:
         """Return the finding of a step that is finite when repeated: a GPU sums in another order."""
-        return self._found("gradient", step.iteration, step.view, {}, _seen(step, keep, loss))
+        return self._finding("gradient", step.iteration, step.view, {}, _seen(step, keep, loss))
 
     def due(self, iteration: int) -> bool:
         """Whether parameters are checked after this iteration in any case."""
@@ -129,9 +129,9 @@ class Watchdog:
         if not _finite(named):
             bad = _bad_rows(named)
             if bad:
-                raise self._found("parameter", iteration, view, bad, {"gaussians": named})
+                raise self._finding("parameter", iteration, view, bad, {"gaussians": named})
 
-    def _found(
+    def _finding(
         self,
         what: Kind,
         iteration: int,
@@ -177,14 +177,14 @@ class Watchdog:
         }
         self.rollbacks, self.every = [*earlier, rollback], 1
 
-    def final(self, error: NonFinite, where: Path) -> NonFinite:
+    def final_error(self, error: NonFinite, where: Path) -> NonFinite:
         """Return the error that ends the run, with the folder that holds what reproduces it."""
         after = f" after {len(self.rollbacks)} rollbacks" if self.rollbacks else ""
         folder = shlex.quote(str(self.folder))
         return NonFinite(
             error.finding,
             error.view,
-            error.seen,
+            error.tensors,
             f"{error}{after}; what the step saw is in {where}, and 'aw stress --replay {folder}' runs up to "
             "it again from the last good state; --set train.on_nonfinite=rollback leaves such a photo out "
             "and goes on",
@@ -207,7 +207,7 @@ class Watchdog:
                 shutil.copyfile(good, temporary)
         else:
             (where / GOOD).unlink(missing_ok=True)  # left by an earlier run in this folder
-        checkpoint.save(where / STEP, error.seen)
+        checkpoint.save(where / STEP, error.tensors)
         report = asdict(error.finding) | {
             "message": str(error),
             "seed": self.seed,

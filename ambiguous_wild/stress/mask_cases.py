@@ -22,7 +22,14 @@ from ambiguous_wild.methods.refinesplat.merging import (
     overlap,
 )
 from ambiguous_wild.methods.refinesplat.recipe import consistency_loss
-from ambiguous_wild.methods.refinesplat.threshold import Variant, entropy, learnt, objective, pool_of, t_ent
+from ambiguous_wild.methods.refinesplat.threshold import (
+    Variant,
+    entropy,
+    instance_stats,
+    objective,
+    t_ent,
+    updated_theta,
+)
 from ambiguous_wild.metrics import ambiguity
 from ambiguous_wild.metrics.image import psnr, ssim, ssim_inria
 from ambiguous_wild.metrics.mask_scores import confusion, psnr_valid
@@ -37,7 +44,7 @@ def _logits(n: int, channels: int, scale: float, seed: int = 0) -> torch.Tensor:
 
 def _flagged(values: np.ndarray, *settings: Any, **more: Any) -> np.ndarray:
     """Return which instances are above T_ent, [K] bool."""
-    return values > float(t_ent(pool_of(torch.from_numpy(values)), *settings, **more).threshold)
+    return values > float(t_ent(instance_stats(torch.from_numpy(values)), *settings, **more).threshold)
 
 
 @case(11, "entropy at logits of 1e4 either way, for 1, 2 and 255 identities")
@@ -87,7 +94,7 @@ def skewed(device: str) -> CaseResult:
     checks = {}
     for high in (1, 3, 20):
         low, far = rng.normal(0.1, 0.01, 50 - high), rng.normal(0.8, 0.03, high)
-        threshold = float(t_ent(pool_of(torch.from_numpy(np.r_[low, far])), gate=5.0).threshold)
+        threshold = float(t_ent(instance_stats(torch.from_numpy(np.r_[low, far])), gate=5.0).threshold)
         checks[f"{high} of 50 apart"] = bool(low.max() < threshold < far.min())
     many = np.r_[0.05, rng.normal(0.8, 0.01, 49)]
     checks["49 of 50: the majority is the scene"] = bool(_flagged(many, gate=5.0).mean() < 0.1)
@@ -134,7 +141,7 @@ def planted_region(device: str) -> CaseResult:
 @case(16, "printed formulas where they degenerate")
 def literal(device: str) -> CaseResult:
     values = np.r_[np.full(20, 0.05), 0.25, 0.3] + np.arange(22) * 1e-4
-    scores = objective(pool_of(torch.from_numpy(values)), 0.5, "literal")[0].numpy()
+    scores = objective(instance_stats(torch.from_numpy(values)), 0.5, "literal")[0].numpy()
     unit, zero = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64)
     away = np.array([[-2.0, 0, 0], [2.0, 0, 0]])
     printed = (np.eye(3) + away[:, :, None] * -away[:, None, :]).mean(0)
@@ -209,8 +216,8 @@ def learnt_weight(device: str) -> CaseResult:
         rng, theta = np.random.default_rng(0), torch.zeros((), dtype=torch.float64)
         one = torch.ones(40, dtype=torch.float64)
         for _ in range(300):
-            pool = pool_of(torch.from_numpy(rng.gamma(2.0, 1.0, 40)))
-            theta = learnt(theta, pool, residual * one, one, torch.tensor(0.5))
+            pool = instance_stats(torch.from_numpy(rng.gamma(2.0, 1.0, 40)))
+            theta = updated_theta(theta, pool, residual * one, one, torch.tensor(0.5))
         w2, single = float(torch.sigmoid(theta)), float(torch.sigmoid(theta.float()))
         checks[f"{name}: inside (0, 1), in float32 too"] = 0 < w2 < 1 and 0 < single < 1
         checks[f"{name}: moved that way"] = (w2 < 0.5) == (name == "down")

@@ -205,9 +205,9 @@ def chosen_parts(
 
 def _skybox(means: np.ndarray, scene: Scene) -> np.ndarray:
     """Tell which Gaussians [N] lie on the sphere on which the skybox is laid out."""
-    from ambiguous_wild.splat.effects.skybox import sphere_of
+    from ambiguous_wild.splat.effects.skybox import skybox_sphere
 
-    middle, radius = sphere_of([view.camera for view in scene.train], scene.points.xyz)
+    middle, radius = skybox_sphere([view.camera for view in scene.train], scene.points.xyz)
     return np.asarray(np.linalg.norm(means - middle, axis=1) > 0.5 * radius)
 
 

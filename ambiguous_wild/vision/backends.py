@@ -14,7 +14,7 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.weight_files import expanded
 from ambiguous_wild.vision.protocols import Features, Instances
-from ambiguous_wild.vision.weight_registry import find, named
+from ambiguous_wild.vision.weight_registry import find_weight, get_weight
 
 # name in a spec -> name of the weights, see vision/weight_registry.py
 DINO = {
@@ -52,7 +52,7 @@ BY_MACHINE = {"by_machine": True}
 
 
 @dataclasses.dataclass(frozen=True)
-class Spec:
+class BackendSpec:
     """A back end as written: ``name[@size][:argument][,key=value...]``."""
 
     name: str
@@ -61,7 +61,7 @@ class Spec:
     options: dict[str, str]
 
 
-def parse(text: str) -> Spec:
+def parse_spec(text: str) -> BackendSpec:
     """Parse a spec; options are read from its end, so that prompts may contain commas.
 
     Raises:
@@ -77,10 +77,12 @@ def parse(text: str) -> Spec:
     name, at, size = head.partition("@")
     if at and not size.isdecimal():
         raise AwError(f"back end {text!r}: {size!r} is not a size; write whole px, as in dinov2-small@252")
-    return Spec(name.strip(), int(size) if at else None, argument.strip(), dict(reversed(options.items())))
+    return BackendSpec(
+        name.strip(), int(size) if at else None, argument.strip(), dict(reversed(options.items()))
+    )
 
 
-def check_features(spec: str) -> Spec:
+def check_features(spec: str) -> BackendSpec:
     """Parse a spec of features; nothing is loaded.
 
     Raises:
@@ -89,13 +91,13 @@ def check_features(spec: str) -> Spec:
     return _known("features", spec, FEATURES)
 
 
-def check_instances(spec: str) -> Spec:
+def check_instances(spec: str) -> BackendSpec:
     """Parse a spec of instances; raises like `check_features`."""
     return _known("instances", spec, INSTANCES)
 
 
-def _known(kind: str, spec: str, names: tuple[str, ...]) -> Spec:
-    parsed = parse(spec)
+def _known(kind: str, spec: str, names: tuple[str, ...]) -> BackendSpec:
+    parsed = parse_spec(spec)
     if parsed.name not in names:
         raise unknown(kind, parsed.name, names)
     return parsed
@@ -149,7 +151,7 @@ def make_instances(spec: str) -> Instances:
     parsed = check_instances(spec)
     if parsed.argument and parsed.name not in ("grounded", "grounded-video", "labels"):
         raise AwError(f"instances {spec!r}: {parsed.name} takes nothing after a colon; remove it")
-    builders: dict[str, Callable[[Spec, str], Instances]] = {
+    builders: dict[str, Callable[[BackendSpec, str], Instances]] = {
         "graph": _graph,
         **dict.fromkeys(CONV, _grouped),
         "labels": _labels,
@@ -159,7 +161,7 @@ def make_instances(spec: str) -> Instances:
     return builders.get(parsed.name, _sam)(parsed, spec)
 
 
-def _graph(parsed: Spec, spec: str) -> Instances:
+def _graph(parsed: BackendSpec, spec: str) -> Instances:
     from ambiguous_wild.vision.segments import GraphSegments, SegmentConfig
 
     if parsed.size is not None:
@@ -167,7 +169,7 @@ def _graph(parsed: Spec, spec: str) -> Instances:
     return GraphSegments(with_options(SegmentConfig(), parsed.options, "option of graph"))
 
 
-def _grouped(parsed: Spec, spec: str) -> Instances:
+def _grouped(parsed: BackendSpec, spec: str) -> Instances:
     from ambiguous_wild.vision.convnets import ConvConfig, ConvFeatures
     from ambiguous_wild.vision.segments import GroupConfig, GroupedSegments
 
@@ -179,7 +181,7 @@ def _grouped(parsed: Spec, spec: str) -> Instances:
     return GroupedSegments(features, config)
 
 
-def _labels(parsed: Spec, spec: str) -> Instances:
+def _labels(parsed: BackendSpec, spec: str) -> Instances:
     from ambiguous_wild.vision.label_maps import LabelMaps, SceneLabelMaps
 
     if parsed.size is not None or not parsed.argument:
@@ -192,7 +194,7 @@ def _labels(parsed: Spec, spec: str) -> Instances:
     return (SceneLabelMaps if flag == "true" else LabelMaps)(parsed.argument)
 
 
-def _grounded(parsed: Spec, spec: str) -> Instances:
+def _grounded(parsed: BackendSpec, spec: str) -> Instances:
     from ambiguous_wild.vision.grounded import GroundedConfig, GroundedInstances
 
     folder, options = _weights(parsed.options)
@@ -211,7 +213,7 @@ def _grounded(parsed: Spec, spec: str) -> Instances:
     return SamVideoInstances(SAM_VIDEO["sam2-video"], video, sam_folder, instances)
 
 
-def _sam(parsed: Spec, spec: str) -> Instances:
+def _sam(parsed: BackendSpec, spec: str) -> Instances:
     folder, options = _weights(parsed.options)
     if parsed.name in SAM:
         from ambiguous_wild.vision.sam import SamConfig, SamInstances
@@ -223,7 +225,7 @@ def _sam(parsed: Spec, spec: str) -> Instances:
     return SamVideoInstances(SAM_VIDEO[parsed.name], video, folder)
 
 
-def _sized(config: Config, parsed: Spec, options: dict[str, str], size: str = "size") -> Config:
+def _sized(config: Config, parsed: BackendSpec, options: dict[str, str], size: str = "size") -> Config:
     """Return the config with these options, and with the spec's size as the option of this name."""
     sizes = {} if parsed.size is None else {size: str(parsed.size)}
     return with_options(config, options | sizes, f"option of {parsed.name}")
@@ -235,21 +237,24 @@ def _weights(options: dict[str, str], key: str = "weights") -> tuple[Path | None
     return (expanded(options[key], key) if key in options else None), rest
 
 
-def _no_options(parsed: Spec, spec: str) -> None:
+def _no_options(parsed: BackendSpec, spec: str) -> None:
     if parsed.options or parsed.size is not None:
         raise AwError(f"features {spec!r}: {parsed.name} takes no options")
 
 
-def first_here(*specs: str) -> str:
+def first_available(*specs: str) -> str:
     """Return the first of these specs that can run on this machine, else the last; nothing is loaded."""
-    return next((spec for spec in specs[:-1] if _can_run(parse(spec).name)), specs[-1])
+    return next((spec for spec in specs[:-1] if _can_run(parse_spec(spec).name)), specs[-1])
 
 
 def _can_run(name: str) -> bool:
     """Whether the weights are on this machine, and the package that runs them is installed."""
     if name in CONV:
-        return find(named(name))[0] is not None
+        return find_weight(get_weight(name))[0] is not None
     weights = (DINO | SAM).get(name)
     if weights is None:
         return True
-    return find(named(weights))[0] is not None and importlib.util.find_spec("transformers") is not None
+    return (
+        find_weight(get_weight(weights))[0] is not None
+        and importlib.util.find_spec("transformers") is not None
+    )

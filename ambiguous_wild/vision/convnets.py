@@ -220,7 +220,7 @@ class ConvFeatures(Features):
                 line = " ".join(str(error).split())
                 raise AwError(f"{self.path} is not {self._what} ({line}); {advice}") from None
             if self._registered:
-                weight = weight_registry.named(self._what)
+                weight = weight_registry.get_weight(self._what)
                 arrays = used_tensors(weight, {key: value.numpy() for key, value in tensors.items()})
                 check_published(weight, self.path, arrays, advice, self._sha256)
             self._model = net.eval().requires_grad_(False)
@@ -254,11 +254,11 @@ class ConvFeatures(Features):
 
 def _file(name: str, folder: str | Path | None) -> Path:
     """Find the file of the weights, in the folder if the user names one."""
-    weight = weight_registry.named(name)
+    weight = weight_registry.get_weight(name)
     if folder is None:
-        path = weight_registry.where(weight)
+        path = weight_registry.weight_path(weight)
         if path is None:
-            raise AwError(weight_registry.missing(weight))
+            raise AwError(weight_registry.missing_error(weight))
         return path
     place = expanded(folder, "the folder of weights")
     files = [place / file for file in weight.files if (place / file).is_file()]

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core.config import State
-from ambiguous_wild.vision.protocols import Features, blurred_noisy_copy, check_image, spaced
+from ambiguous_wild.vision.protocols import Features, blurred_noisy_copy, check_image, evenly_spaced_indices
 
 STRIDE = 4  # px of the image per cell of the grid
 BINS = 9  # orientations over 180 degrees
@@ -59,7 +59,7 @@ class LabHog(Features):
         Raises:
             AwError: there is no photo.
         """
-        chosen = [photos[k] for k in spaced(len(photos), self.fit_photos)]
+        chosen = [photos[k] for k in evenly_spaced_indices(len(photos), self.fit_photos)]
         pairs = [_blocks(photo) for photo in chosen]
         hogs = torch.cat([hog.reshape(-1, HOG_CHANNELS) for _, hog in pairs]).double()
         device = photos[0].device

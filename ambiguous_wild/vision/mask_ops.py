@@ -66,7 +66,7 @@ def paint(
     return table[painted], order[seen - 1]
 
 
-def add_new(
+def add_untracked(
     tracked: np.ndarray,  # [H, W] int32, scene-wide ids, 0 = none
     detected: np.ndarray,  # [H, W] int32, this photo's instances
     first_id: int,
@@ -95,7 +95,9 @@ def add_new(
     return result, first_id + min(len(fresh), room)
 
 
-def unsupported(labels: np.ndarray, scene: Scene, name: str, most: float, least_track: int = 3) -> np.ndarray:
+def drop_static_instances(
+    labels: np.ndarray, scene: Scene, name: str, most: float, least_track: int = 3
+) -> np.ndarray:
     """Remove the instances that SfM points show to be static from a label map.
 
     Source: AsymGS (arXiv 2506.03538), the filter of its instance proposals.
@@ -121,7 +123,7 @@ def unsupported(labels: np.ndarray, scene: Scene, name: str, most: float, least_
     return np.where(static[labels], 0, labels)
 
 
-def keep_unsuspicious(labels: Tensor, suspect: Tensor) -> Tensor:
+def keep_from_suspects(labels: Tensor, suspect: Tensor) -> Tensor:
     """Make the keep map [H, W] that drops instances more suspect than the photo is on average.
 
     Args:

@@ -59,8 +59,8 @@ def locate(name: str, model_types: Sequence[str], explicit: str | Path | None = 
         )
     if explicit is not None:
         return _inspect(name, expanded(explicit, "the folder of weights"), model_types)
-    weight = weight_registry.named(name)
-    folder, reason = weight_registry.find(weight)
+    weight = weight_registry.get_weight(name)
+    folder, reason = weight_registry.find_weight(weight)
     return _inspect(name, folder or _download(weight, reason), model_types)
 
 
@@ -179,7 +179,7 @@ def _inspect(name: str, folder: Path, model_types: Sequence[str]) -> Pretrained:
 def _advice(name: str, folder: Path) -> str:
     """Say what to do about unusable files; the command replaces only a folder that it finds itself."""
     registered = {weight.name: weight for weight in weight_registry.KNOWN + weight_registry.OTHER_SIZES}
-    if name in registered and weight_registry.where(registered[name]) == folder:
+    if name in registered and weight_registry.weight_path(registered[name]) == folder:
         return f"run: {weight_registry.get_command(name, again=True)}"
     return "replace this folder by a complete one"
 
@@ -198,8 +198,10 @@ def _download(weight: weight_registry.Weight, reason: str) -> Path:
     """Download the weights into the weights folder, unless the hub is switched off."""
     try:
         if weight_download.offline():
-            raise weight_download.not_from_hub(weight, weight_download.switched_off())
-        return weight_download.get([weight], lambda line: print(line, file=sys.stderr, flush=True))[0]
+            raise weight_download.hub_error(weight, weight_download.switched_off())
+        return weight_download.download_weights(
+            [weight], lambda line: print(line, file=sys.stderr, flush=True)
+        )[0]
     except AwError as error:
         raise AwError(f"the weights of {weight.name} are missing ({reason}); {error}") from None
 

@@ -91,7 +91,7 @@ class SceneInstances(Protocol):
         ...
 
 
-def spaced(count: int, most: int) -> list[int]:
+def evenly_spaced_indices(count: int, most: int) -> list[int]:
     """Return indices of `most` of `count` training photos, evenly spaced; of all if there are fewer.
 
     Raises:
@@ -133,7 +133,7 @@ def degraded_distance(features: Callable[[Tensor], Tensor], photos: Sequence[Ten
         AwError: there is no photo.
     """
     means = []
-    for index in spaced(len(photos), most):
+    for index in evenly_spaced_indices(len(photos), most):
         one, two = features(photos[index]), features(blurred_noisy_copy(photos[index], index))
         means.append((1.0 - F.cosine_similarity(one, two, dim=2)).double().mean().item())
     # rounded, because it is part of cache keys and its last bits depend on the number of threads

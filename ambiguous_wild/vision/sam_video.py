@@ -22,7 +22,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import config_hash
 from ambiguous_wild.io.files import natural_key
 from ambiguous_wild.io.progress_bar import Progress
-from ambiguous_wild.vision.mask_ops import add_new
+from ambiguous_wild.vision.mask_ops import add_untracked
 from ambiguous_wild.vision.precompute import cache_key, cached, photo_labels
 from ambiguous_wild.vision.pretrained import load, locate
 from ambiguous_wild.vision.protocols import Instances
@@ -103,7 +103,7 @@ class SamVideoInstances:
             frames = [photos[i] for i in chunk]
             detected = photo_labels(self.single, frames[0], folder)
             empty = np.zeros_like(detected)
-            first, next_id = add_new(
+            first, next_id = add_untracked(
                 empty if carried is None else carried, detected, next_id, self.config.most, self.config.known
             )
             maps = self._tracked(frames, first, folder)

@@ -33,8 +33,8 @@ from ambiguous_wild.vision.protocols import (
     Features,
     blurred_noisy_copy,
     check_image,
+    evenly_spaced_indices,
     gaussian_blur,
-    spaced,
 )
 
 Tracks = tuple[np.ndarray, np.ndarray, np.ndarray]  # point [L], photo [L], xy px [L, 2]
@@ -75,7 +75,7 @@ def train(make: Callable[[], Net], photos: Sequence[Tensor], tracks: Tracks, con
     Raises:
         AwError: no photos, tracks of other photos, or too few tracks.
     """
-    pairs = Pairs(tracks, [(p.shape[1], p.shape[0]) for p in photos], config.fewest)
+    pairs = CovisiblePairs(tracks, [(p.shape[1], p.shape[0]) for p in photos], config.fewest)
     images = [photo.permute(2, 0, 1).contiguous() for photo in photos]
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the rounding of sums depends on the number of threads
@@ -87,7 +87,7 @@ def train(make: Callable[[], Net], photos: Sequence[Tensor], tracks: Tracks, con
         torch.set_num_threads(threads)
 
 
-def _train(net: Net, images: list[Tensor], pairs: Pairs, config: SceneConvConfig) -> Net:
+def _train(net: Net, images: list[Tensor], pairs: CovisiblePairs, config: SceneConvConfig) -> Net:
     rng = np.random.default_rng(config.seed)
     optimiser = torch.optim.Adam(net.parameters(), lr=config.rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _cycle(step, config.steps))
@@ -98,7 +98,7 @@ def _train(net: Net, images: list[Tensor], pairs: Pairs, config: SceneConvConfig
         rows = np.flatnonzero(inside_i & inside_j)
         rows = rng.permutation(rows)[: config.anchors]
         first = sample(net(one[None]), xy_i[rows])
-        second = sample(net(imitated_render(two, rng)[None]), xy_j[rows])
+        second = sample(net(degraded_render(two, rng)[None]), xy_j[rows])
         loss = info_nce(first, second, xy_i[rows], xy_j[rows], config.temperature, config.far_px)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -107,7 +107,7 @@ def _train(net: Net, images: list[Tensor], pairs: Pairs, config: SceneConvConfig
     return net.requires_grad_(False).eval()
 
 
-class Pairs:
+class CovisiblePairs:
     """Pairs of photos and the points they share."""
 
     def __init__(self, tracks: Tracks, sizes: Sequence[tuple[int, int]], fewest: int) -> None:
@@ -179,7 +179,7 @@ def sample(features: Tensor, xy: np.ndarray) -> Tensor:
     return F.normalize(sampled[0, :, 0].T, dim=1, eps=1e-6)
 
 
-def imitated_render(image: Tensor, rng: np.random.Generator) -> Tensor:
+def degraded_render(image: Tensor, rng: np.random.Generator) -> Tensor:
     """A photo [3, H, W] degraded like an unfinished splat render: uneven blur and shift, noise, gain.
 
     Blur of 0.6 to 3.5 px that varies over the image, shift up to 1.5 px, smooth noise up to 0.03; in half of
@@ -314,7 +314,7 @@ class SceneConv(Features):
             AwError: there is no photo, or no trained net.
         """
         distances = []
-        for index, k in enumerate(spaced(len(photos), self.fit_photos)):
+        for index, k in enumerate(evenly_spaced_indices(len(photos), self.fit_photos)):
             one, two = self(photos[k]), self(blurred_noisy_copy(photos[k], index))
             distances.append(float((1.0 - (one * two).sum(2)).double().mean()))
         # a scene of one colour has distance 0

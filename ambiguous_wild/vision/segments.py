@@ -64,10 +64,10 @@ class GraphSegments:
         """Segments [H, W] int32 from 1 of a photo [H, W, 3] in [0, 1]; deterministic."""
         rgb = (photo.detach().cpu().numpy().clip(0.0, 1.0) * 255.0).round().astype(np.uint8)
         lab = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2LAB)
-        return segment(lab, self.config)
+        return graph_segment(lab, self.config)
 
 
-def segment(lab: np.ndarray, config: SegmentConfig) -> np.ndarray:
+def graph_segment(lab: np.ndarray, config: SegmentConfig) -> np.ndarray:
     """Labels [H, W] int32 from 1 of an 8-bit image [H, W, 3]; bisects k for the wanted count.
 
     The count decreases with k. Three tries reach the range on most photos; a photo without structure stays
@@ -177,7 +177,7 @@ class GroupedSegments:
         """Labels [H, W] int32 from 1 of a photo [H, W, 3] in [0, 1]; deterministic."""
         segments = self._segments.labels(photo)
         phi = self.features(photo).double().cpu().numpy()
-        return group(segments, segment_features(segments, phi), self.config)
+        return merge_segments(segments, segment_features(segments, phi), self.config)
 
 
 def segment_features(
@@ -196,7 +196,7 @@ def segment_features(
     return shares @ centred / shares.sum(1, keepdims=True)
 
 
-def group(
+def merge_segments(
     labels: np.ndarray,  # [H, W] int, 1..K
     features: np.ndarray,  # [K, C]
     config: GroupConfig,

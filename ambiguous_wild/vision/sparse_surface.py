@@ -21,7 +21,7 @@ _FRAME_PIXELS = 1000  # pixels of a map that says how many cameras have a place 
 _MAX_POINTS = 4000  # a random subset; more points are slower and not better (see docs/metrics.md)
 
 
-def some_points(xyz: np.ndarray) -> np.ndarray:
+def subsample_points(xyz: np.ndarray) -> np.ndarray:
     """Return a fixed random subset of the points [M, 3], large enough for surfaces."""
     if len(xyz) <= _MAX_POINTS:
         return xyz
@@ -54,11 +54,11 @@ def inverse_depth(camera: Camera, points: np.ndarray) -> np.ndarray | None:
 
 def static_surfaces(cameras: Sequence[Camera], xyz: np.ndarray) -> list[np.ndarray | None]:
     """`inverse_depth` of every camera, from all sparse points [M, 3] of a scene."""
-    some = some_points(xyz)
+    some = subsample_points(xyz)
     return [inverse_depth(camera, some) for camera in cameras]
 
 
-def seldom_seen(
+def rarely_covered(
     cameras: Sequence[Camera], surfaces: Sequence[np.ndarray | None], least: int
 ) -> list[np.ndarray | None]:
     """Find places that lie in the frame of fewer than `least` other cameras; occlusion is ignored.

@@ -14,7 +14,7 @@ _SIDE = 64  # px of the picture that features are computed for
 
 
 @dataclass(frozen=True)
-class Verdict:
+class WeightCheck:
     """The result of checking one of the weights."""
 
     name: str
@@ -22,15 +22,15 @@ class Verdict:
     detail: str  # what was checked, or what is wrong
 
 
-def verify(weight: Weight) -> Verdict:
+def verify(weight: Weight) -> WeightCheck:
     """Load the weights, every tensor by name and shape, and compare hashes where they are known.
 
     Features are also computed once. Nothing is downloaded.
     """
     try:
-        place = weight_registry.where(weight)
+        place = weight_registry.weight_path(weight)
         if place is None:
-            raise AwError(weight_registry.missing(weight))
+            raise AwError(weight_registry.missing_error(weight))
         advice = f"run: {weight_registry.get_command(weight.name)}"
         if weight.kind == "file":
             count, hashes = check_file(weight, place, advice), "sha256 as published"
@@ -38,9 +38,9 @@ def verify(weight: Weight) -> Verdict:
             recorded = check_folder(weight, place, advice)
             count, hashes = _load(weight, place), "sha256 as downloaded"
             hashes = hashes if recorded else "no record of their sha256"
-        return Verdict(weight.name, True, f"{count} tensors, {hashes}: {place}")
+        return WeightCheck(weight.name, True, f"{count} tensors, {hashes}: {place}")
     except AwError as error:
-        return Verdict(weight.name, False, str(error))
+        return WeightCheck(weight.name, False, str(error))
 
 
 def _load(weight: Weight, folder: Path) -> int:

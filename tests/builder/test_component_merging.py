@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.builder import registration
-from ambiguous_wild.builder.component_merging import Similarity, merge
-from ambiguous_wild.builder.matched import Matched, PointLookup, largest_component
+from ambiguous_wild.builder.component_merging import Similarity, merge_components
+from ambiguous_wild.builder.matched import MatchedPhotos, PointLookup, largest_component
 from ambiguous_wild.builder.pose_hypothesis import PoseHypothesis
 from ambiguous_wild.builder.registration import Registration, _cells, centre_of
 from ambiguous_wild.builder.relative_poses import RelativePose
@@ -62,7 +62,7 @@ def components_of(
         matches[a, b] = np.column_stack([both, both])
         if across.get((a, b)) is not None:
             matches[a, b] = np.column_stack([both, np.roll(both, 7)])  # of something else
-    matched = Matched([*range(1, 7)], [f"{k}.jpg" for k in range(6)], [camera] * 6, pixels, matches)
+    matched = MatchedPhotos([*range(1, 7)], [f"{k}.jpg" for k in range(6)], [camera] * 6, pixels, matches)
     for (a, b), rows in matches.items():
         matched.relative_poses[a, b] = [relative_pose(poses[a], poses[b], len(rows), across.get((a, b)))]
     found = []
@@ -79,7 +79,7 @@ def components_of(
         centres = np.array([-p[:, :3].T @ p[:, 3] for p in component.poses.values()])
         component.radius = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
     found[1].radius /= WORLD.scale
-    found[1].poses = {k: back.moved(p) for k, p in found[1].poses.items()}  # in a world of its own
+    found[1].poses = {k: back.transform_pose(p) for k, p in found[1].poses.items()}  # in a world of its own
     return found[0], found[1]
 
 
@@ -100,7 +100,7 @@ def errors(component: Registration) -> tuple[float, float]:
 
 def test_two_pairs_that_agree_merge_two_components_exactly():
     first, second = components_of({(2, 3): None, (1, 4): None})
-    assert merge(first, second) and first.poses.keys() == {*HERE, *THERE}
+    assert merge_components(first, second) and first.poses.keys() == {*HERE, *THERE}
     turned, moved = errors(first)
     assert turned < 1e-3 and moved < 1e-3
     assert first.merged == [frozenset(THERE)]
@@ -110,7 +110,7 @@ def test_pairs_that_agree_on_the_rotation_do_not_compete():
     """Before the components are adjusted together, many pairs of the right rotation have few inliers."""
     same = np.eye(3)
     first, second = components_of({(2, 3): None, (1, 4): None, (0, 3): same, (1, 3): same})
-    assert merge(first, second)
+    assert merge_components(first, second)
 
 
 def test_lenses_that_only_the_second_component_has_come_with_it():
@@ -120,12 +120,12 @@ def test_lenses_that_only_the_second_component_has_come_with_it():
     first.matched = replace(first.matched, cameras=own)
     for k in HERE:
         own[k].params = [FOCAL, 320, 240, 0]
-    assert merge(first, second)
+    assert merge_components(first, second)
     assert [camera.params[0] for camera in own] == [FOCAL] * 6
     first, second = components_of({(2, 3): None})
     own[4].params = [550.0, 320, 240, 0]
     first.matched = replace(first.matched, cameras=own)
-    assert not merge(first, second) and own[4].params[0] == 550.0
+    assert not merge_components(first, second) and own[4].params[0] == 550.0
 
 
 def test_a_photo_with_a_pose_in_both_components_merges_them_along_a_straight_path():
@@ -133,7 +133,7 @@ def test_a_photo_with_a_pose_in_both_components_merges_them_along_a_straight_pat
     for component in (first, second):
         component.model = SimpleNamespace(points3D=observed(component))
     first.matched.ids[:] = range(6)
-    assert merge(first, second)
+    assert merge_components(first, second)
     moved = [np.linalg.norm(centre_of(first.poses[k]) - centre_of(pose(k, 0.0))) for k in range(6)]
     assert max(moved) < 0.05
 
@@ -165,7 +165,7 @@ def observed(component: Registration) -> dict[int, SimpleNamespace]:
 )
 def test_too_little_evidence_merges_nothing(across, bend):
     first, second = components_of(across, bend)
-    assert not merge(first, second) and first.poses.keys() == set(HERE)
+    assert not merge_components(first, second) and first.poses.keys() == set(HERE)
 
 
 def test_pairs_that_agree_on_something_else_prevent_a_merge():
@@ -176,7 +176,7 @@ def test_pairs_that_agree_on_something_else_prevent_a_merge():
         first.matched.relative_poses[a, b] = [
             RelativePose(np.arange(20), turned[None], first.matched.relative_poses[a, b][0].translations)
         ]
-    assert not merge(first, second)
+    assert not merge_components(first, second)
 
 
 def test_only_the_largest_component_is_kept():
@@ -223,7 +223,7 @@ def test_pairs_whose_inliers_are_clustered_merge_no_components():
             pixels = first.matched.features[a][first.matched.matches[a, b][:, 0]]
             rows = np.argsort(pixels.sum(axis=1))[:4]
             first.matched.relative_poses[a, b] = [replace(relative_pose, matches=rows)]
-    assert not merge(first, second)
+    assert not merge_components(first, second)
 
 
 def registered_with_noise(weak: int | None) -> Registration:

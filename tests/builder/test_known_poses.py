@@ -15,7 +15,7 @@ from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
-from ambiguous_wild.harness.regions import true_shadow
+from ambiguous_wild.harness.regions import exact_shadow
 from ambiguous_wild.io.images import image_size, pillow, read_gray
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.simulate.capture_writer import simulate
@@ -87,7 +87,7 @@ def test_a_scene_carries_its_protocol_and_the_shadows_of_its_distractors(tmp_pat
     assert json.loads((scene / "nb-info.json").read_text())["evaluation_protocol"] == "nerfw"
     opened = load_scene(scene)
     for view in opened.train:
-        shadow = true_shadow(opened, view)
+        shadow = exact_shadow(opened, view)
         before = read_gray(tmp_path / "raw" / "truth" / "shadow" / f"{Path(view.name).stem}.png")
         assert shadow is not None and shadow.any()
         np.testing.assert_array_equal(shadow, before > 0)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.builder.moving_features import Votes, _number_motions, seen_through
+from ambiguous_wild.builder.moving_features import Votes, _number_motions, free_space_violation_counts
 from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
@@ -315,7 +315,7 @@ def test_what_stands_in_some_photos_and_is_gone_in_others_is_seen_through():
         if len(places) > 1:
             elements = [pycolmap.TrackElement(*place) for place in places]
             model.add_point3D(xyz[row], pycolmap.Track(elements), np.zeros(3, np.uint8))
-    through = seen_through(model, {number: number for number in range(1, cameras + 1)})
+    through = free_space_violation_counts(model, {number: number for number in range(1, cameras + 1)})
     of_kind = [np.concatenate([through[n][kind[shown[n]] == k] for n in shown]) for k in range(3)]
     assert np.mean(of_kind[1] >= 4) > 0.9  # the six photos that it is gone in, less the borders
     assert of_kind[0].max() == 0 and np.mean(of_kind[2] >= 2) < 0.02

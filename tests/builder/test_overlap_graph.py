@@ -13,8 +13,8 @@ from ambiguous_wild.builder.overlap_graph import (
     best_link_between,
     bridges,
     connected_components,
-    graph_of,
-    lay_out,
+    graph_layout,
+    overlap_graph,
     predict_growth,
     weakly_connected,
 )
@@ -25,10 +25,10 @@ def test_a_bridge_is_a_link_without_which_a_component_falls_into_two(seed: int) 
     rng = np.random.default_rng(seed)
     ends = {tuple(sorted(rng.choice(12, 2, replace=False).tolist())) for _ in range(14)}
     links = [(a, b, 20) for a, b in sorted(ends)]
-    components = len(connected_components(graph_of(12, links)))
-    without = {link[:2]: graph_of(12, [k for k in links if k != link]) for link in links}
+    components = len(connected_components(overlap_graph(12, links)))
+    without = {link[:2]: overlap_graph(12, [k for k in links if k != link]) for link in links}
     wanted = {pair for pair, graph in without.items() if len(connected_components(graph)) > components}
-    assert bridges(graph_of(12, links)) == wanted and wanted
+    assert bridges(overlap_graph(12, links)) == wanted and wanted
 
 
 def test_photos_with_one_or_two_links_are_weakly_connected() -> None:
@@ -46,19 +46,19 @@ def test_the_best_link_has_most_matches_else_it_is_by_the_order_of_capture() -> 
 
 def test_a_ring_is_laid_out_as_a_ring_and_a_walk_as_a_line() -> None:
     ring = [(min(k, (k + 1) % 12), max(k, (k + 1) % 12), 50) for k in range(12)]
-    xy = lay_out(12, ring)
+    xy = graph_layout(12, ring)
     radius = np.linalg.norm(xy - xy.mean(axis=0), axis=1)
     assert radius.std() < 0.05 * radius.mean()
-    walk = lay_out(9, [(k, k + 1, 50) for k in range(8)])
+    walk = graph_layout(9, [(k, k + 1, 50) for k in range(8)])
     assert (np.diff(walk[:, 0]) > 0.5).all() and np.ptp(walk[:, 1]) < 0.1
 
 
 def test_components_and_single_photos_do_not_cover_each_other() -> None:
     links = [(0, 1, 40), (1, 2, 40), (0, 2, 40), (4, 5, 30), (5, 6, 30)]
-    xy = lay_out(9, links)
+    xy = graph_layout(9, links)
     apart = np.linalg.norm(xy[:, None] - xy[None], axis=2) + 9 * np.eye(9)
-    assert apart.min() > 0.5 and (lay_out(9, links) == xy).all()
-    assert np.isfinite(lay_out(3, [])).all() and len({tuple(p) for p in lay_out(3, [])}) == 3
+    assert apart.min() > 0.5 and (graph_layout(9, links) == xy).all()
+    assert np.isfinite(graph_layout(3, [])).all() and len({tuple(p) for p in graph_layout(3, [])}) == 3
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -92,7 +92,7 @@ def test_scene_json_tells_what_was_done(scene):
     assert set(info["files"]) | {"scene.json"} == set(hashes(scene))
     assert info["photos"]["p01.png"]["source"] == "test/p01.jpg"
     assert set(info["seconds"]) >= {"screen", "features", "matches", "mapping", "undistort", "package"}
-    assert 0 < scene_record.sfm_share(info) < 1
+    assert 0 < scene_record.sfm_time_share(info) < 1
     assert "6 of 6" in scene_record.verdict(info, (160, 120), scene)
 
 

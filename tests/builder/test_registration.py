@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.builder import sfm
-from ambiguous_wild.builder.bundle_adjustment import adjustment_options
-from ambiguous_wild.builder.matched import MAPPED_COVISIBLE, Matched, PointLookup, _well_connected
+from ambiguous_wild.builder.bundle_adjustment import bundle_adjustment_options
+from ambiguous_wild.builder.matched import MAPPED_COVISIBLE, MatchedPhotos, PointLookup, _well_connected
 from ambiguous_wild.builder.pipeline import build_scene
-from ambiguous_wild.builder.pose_hypothesis import PoseHypothesis, reason_against
+from ambiguous_wild.builder.pose_hypothesis import PoseHypothesis, rejection_reason
 from ambiguous_wild.builder.registration import Registration
 from ambiguous_wild.builder.relative_poses import (
     RelativePose,
@@ -182,29 +182,29 @@ def test_a_photo_without_a_clear_pose_is_named_with_the_reason():
         return PoseHypothesis(np.eye(4)[:3], frozenset(range(support)), area)
 
     nothing = hypothesis(0, 0)
-    assert reason_against(hypothesis(9, 0.6), hypothesis(7, 0.15), 2) is None
+    assert rejection_reason(hypothesis(9, 0.6), hypothesis(7, 0.15), 2) is None
     assert "two poses: 6 photos agree on one, 5 on another" in str(
-        reason_against(hypothesis(6, 0.2), hypothesis(5, 0.19), 2)
+        rejection_reason(hypothesis(6, 0.2), hypothesis(5, 0.19), 2)
     )
-    assert "no placed photo" in str(reason_against(nothing, nothing, 2))
-    assert "only 2 placed photos" in str(reason_against(hypothesis(2, 0.4), nothing, 3))
-    assert "small part" in str(reason_against(hypothesis(5, 0.07), nothing, 2))
+    assert "no placed photo" in str(rejection_reason(nothing, nothing, 2))
+    assert "only 2 placed photos" in str(rejection_reason(hypothesis(2, 0.4), nothing, 3))
+    assert "small part" in str(rejection_reason(hypothesis(5, 0.07), nothing, 2))
     clustered = PoseHypothesis(
         np.eye(4)[:3], frozenset(range(5)), 0.25, 0.2
     )  # as the matches of a distractor are
-    assert "small part" in str(reason_against(clustered, nothing, 2))
-    assert reason_against(hypothesis(5, 0.25), nothing, 2) is None
+    assert "small part" in str(rejection_reason(clustered, nothing, 2))
+    assert rejection_reason(hypothesis(5, 0.25), nothing, 2) is None
 
 
 def test_only_many_photos_are_adjusted_iteratively():
     sizes = FEW_PHOTOS, FEW_PHOTOS + 1
-    few, many = (adjustment_options(True, photos, final=True).ceres for photos in sizes)
+    few, many = (bundle_adjustment_options(True, photos, final=True).ceres for photos in sizes)
     assert few.auto_select_solver_type and not many.auto_select_solver_type
     assert many.solver_options.linear_solver_type.name == "ITERATIVE_SCHUR"
 
 
 def test_relative_poses_come_back_from_their_file(tmp_path):
-    matched = Matched(
+    matched = MatchedPhotos(
         [1, 2, 3], ["a", "b", "c"], [], [], {(0, 1): np.zeros((30, 2)), (1, 2): np.zeros((9, 2))}
     )
     matched.relative_poses = {
@@ -212,7 +212,7 @@ def test_relative_poses_come_back_from_their_file(tmp_path):
         (1, 2): [],
     }
     matched.save_relative_poses(tmp_path / "m.npz")
-    again = Matched(matched.ids, matched.names, [], [], matched.matches)
+    again = MatchedPhotos(matched.ids, matched.names, [], [], matched.matches)
     again.load_relative_poses(tmp_path / "m.npz")
     assert again.relative_poses[1, 2] == [] and len(again.relative_poses[0, 1]) == 2
     for one, other in zip(matched.relative_poses[0, 1], again.relative_poses[0, 1]):
@@ -261,7 +261,7 @@ def test_the_change_of_focal_length_is_that_of_the_photos_the_mapper_got():
         return pycolmap.Camera(camera_id=number, model="SIMPLE_RADIAL", width=100, height=80, params=params)
 
     cameras = [camera(number, 100.0) for number in range(1, 11)]
-    matched = Matched([*range(1, 11)], [*"abcdefghij"], cameras, [np.zeros((0, 2))] * 10, {})
+    matched = MatchedPhotos([*range(1, 11)], [*"abcdefghij"], cameras, [np.zeros((0, 2))] * 10, {})
     model = pycolmap.Reconstruction()
     for number in (1, 2):
         model.add_camera_with_trivial_rig(camera(number, 110.0))

@@ -9,11 +9,11 @@ from ambiguous_wild.builder.pipeline import build_scene
 from ambiguous_wild.builder.retrieval import (
     SIMILAR,
     best_pairs,
-    embed,
     most_similar,
-    pairs_of_tests,
     retrieval_pairs,
     shared_features,
+    test_set_pairs,
+    vlad_vectors,
 )
 from tests.builder.capture_maker import COUNT, SETTINGS
 
@@ -34,11 +34,11 @@ def places(count, per_place, seed=0):
 
 def test_photos_of_one_place_find_each_other():
     names, place, photos = places(6, 8)
-    vectors = embed(photos.__getitem__, names)
+    vectors = vlad_vectors(photos.__getitem__, names)
     found = most_similar(vectors, range(len(names)), range(len(names)), 7)
     right = np.mean([place[a] == place[b] for a, b in found])
     assert right > 0.95  # by chance: 0.15
-    assert np.array_equal(vectors, embed(photos.__getitem__, names))
+    assert np.array_equal(vectors, vlad_vectors(photos.__getitem__, names))
 
 
 def test_the_number_of_pairs_is_linear():
@@ -48,8 +48,8 @@ def test_the_number_of_pairs_is_linear():
     assert len(pairs) <= 104 * 9
     assert len(pairs) == len({frozenset(p) for p in pairs})
     assert ("p001", "p002") in pairs and all(a != b for a, b in pairs)
-    vectors = embed(photos.__getitem__, names)
-    of_tests = pairs_of_tests(vectors, names, tests)
+    vectors = vlad_vectors(photos.__getitem__, names)
+    of_tests = test_set_pairs(vectors, names, tests)
     assert len(of_tests) <= len(tests) * (2 * SIMILAR + SIMILAR // 2)
     assert all(a in tests or b in tests for a, b in of_tests)
     assert {n for p in of_tests for n in p} >= tests
@@ -58,9 +58,9 @@ def test_the_number_of_pairs_is_linear():
 def test_a_photo_without_features_has_neighbours_only():
     names, _, photos = places(2, 4)
     photos[names[0]] = np.zeros((0, 128), np.uint8)
-    vectors = embed(photos.__getitem__, names)
+    vectors = vlad_vectors(photos.__getitem__, names)
     assert not vectors[0].any() and np.isfinite(vectors).all()
-    assert embed(lambda name: np.zeros((0, 128), np.uint8), names).shape == (8, 64 * 128)
+    assert vlad_vectors(lambda name: np.zeros((0, 128), np.uint8), names).shape == (8, 64 * 128)
 
 
 def test_a_scene_is_built_from_neighbours(built, tmp_path):

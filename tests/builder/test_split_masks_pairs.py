@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ambiguous_wild.builder.keep_masks import find_masks, lay_out_masks, mask_warnings
-from ambiguous_wild.builder.matched import Matched
+from ambiguous_wild.builder.keep_masks import find_masks, mask_warnings, write_colmap_masks
+from ambiguous_wild.builder.matched import MatchedPhotos
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.records import ScreenedPhoto
 from ambiguous_wild.builder.retrieval import sequential_pairs
@@ -106,7 +106,7 @@ def test_masks_are_found_under_both_names(tmp_path):
     found = find_masks(tmp_path / "m", photos_of(3), "error")
     assert sorted(found) == ["p0", "p1", "p2"]
     (tmp_path / "out").mkdir()
-    shares = lay_out_masks(tmp_path / "out", found, photos_of(3), tmp_path)["kept_share"]
+    shares = write_colmap_masks(tmp_path / "out", found, photos_of(3), tmp_path)["kept_share"]
     assert shares == {"p0": 1.0, "p1": 1.0, "p2": 0.0}
     assert read_gray(tmp_path / "out" / "masks" / "p0.png.png").min() == 255  # 200 counts as white
 
@@ -118,7 +118,7 @@ def test_a_mask_is_turned_by_its_own_exif_as_viewers_show_it(tmp_path):
     exif[0x0112] = 3
     (tmp_path / "m").mkdir()
     Image.fromarray(keep).rotate(180).save(tmp_path / "m" / "p0.png", exif=exif)
-    lay_out_masks(tmp_path, find_masks(tmp_path / "m", photos_of(1), "error"), photos_of(1), tmp_path)
+    write_colmap_masks(tmp_path, find_masks(tmp_path / "m", photos_of(1), "error"), photos_of(1), tmp_path)
     assert np.array_equal(read_gray(tmp_path / "masks" / "p0.png.png"), keep)
 
 
@@ -133,7 +133,7 @@ def test_missing_masks_are_named_or_the_photo_is_kept_whole(tmp_path):
     (tmp_path / "m" / "other.png").rename(tmp_path / "m" / "p0.png")
     found = find_masks(tmp_path / "m", photos_of(3), "keep")
     (tmp_path / "out").mkdir()
-    lay_out_masks(tmp_path / "out", found, photos_of(3), tmp_path)
+    write_colmap_masks(tmp_path / "out", found, photos_of(3), tmp_path)
     assert read_gray(tmp_path / "out" / "masks" / "p2.png.png").min() == 255
 
 
@@ -172,7 +172,7 @@ def test_names_that_a_list_of_pairs_cannot_hold_are_matched_too(start, tmp_path)
         (tmp_path / stage).mkdir()
     job.extract_features(tmp_path / "features", "single")
     assert job.match(tmp_path / "matches", tmp_path / "features", posed=True)["pairs"] == 3
-    matched = Matched.read(tmp_path / "matches" / DATABASE)
+    matched = MatchedPhotos.read(tmp_path / "matches" / DATABASE)
     assert matched.names == [photo.name for photo in photos] and len(matched.matches) == 3
 
 

@@ -91,10 +91,11 @@ def test_a_short_video_gives_all_it_has(tmp_path: Path) -> None:
 def test_stretches_of_equals_keep_their_distance() -> None:
     flat = np.full((16, 16, 3), 7, np.uint8)
     frames = ((i, i / 10, flat) for i in range(40))
-    got = [f.index for f in capture_photos.sharpest(frames, [0, 1, 2, 3, 4])]
+    got = [f.index for f in capture_photos.sharpest_frames(frames, [0, 1, 2, 3, 4])]
     assert len(got) == 4 and np.diff(got).min() >= 5
     one_each = [
-        f.index for f in capture_photos.sharpest(((i, float(i), flat) for i in range(4)), [0, 1, 2, 3, 4])
+        f.index
+        for f in capture_photos.sharpest_frames(((i, float(i), flat) for i in range(4)), [0, 1, 2, 3, 4])
     ]
     assert one_each == [0, 1, 2, 3]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from ambiguous_wild.harness.grid import cell_folder, grouped, plan_cells
+from ambiguous_wild.harness.grid import cell_folder, expand_budgets, plan_cells
 from ambiguous_wild.splat.train_config import TrainConfig
 from tests.command_line import aw
 from tests.report.fake_cost import cost_run
@@ -32,13 +32,13 @@ def test_several_lengths_and_effects_have_folders_of_their_own(tmp_path: Path) -
         effects: plan_cells(["3dgs"], [scene], [0], TrainConfig(), effects=effects)
         for effects in ("none", "exposure, poses")
     }
-    cells = grouped(planned, [180.0, 60.0, 60.0])
+    cells = expand_budgets(planned, [180.0, 60.0, 60.0])
     folders = [str(cell_folder(Path("o"), cell)) for cell in cells]
     assert folders == [
         f"o/budget-{b}s/effects-{e}/scene/3dgs/seed0" for b in (60, 180) for e in ("none", "exposure+poses")
     ]
     assert len({cell.identity for cell in cells}) == 4
-    (alone,) = grouped({"none": planned["none"]}, [60.0])
+    (alone,) = expand_budgets({"none": planned["none"]}, [60.0])
     assert cell_folder(Path("o"), alone) == Path("o/scene/3dgs/seed0")
     assert alone.identity == cells[0].identity  # where a run lies is not what it is
-    assert grouped({"none": planned["none"]}) == planned["none"]
+    assert expand_budgets({"none": planned["none"]}) == planned["none"]

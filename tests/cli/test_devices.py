@@ -18,7 +18,7 @@ def here(monkeypatch):
     """Makes this machine the one that is given."""
 
     def be(machine):
-        monkeypatch.setattr(readiness, "look", lambda torch=None: machine)
+        monkeypatch.setattr(readiness, "gpu_facts", lambda torch=None: machine)
 
     return be
 

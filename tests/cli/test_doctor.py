@@ -57,7 +57,7 @@ def test_a_system_package_comes_with_the_command_of_the_machine(
     tool: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/bin/{name}" if name == tool else None)
-    monkeypatch.setattr(doctor.readiness, "first_line", lambda *words: None)
+    monkeypatch.setattr(doctor.readiness, "first_output_line", lambda *words: None)
     fix = doctor._git().fix
     assert fix.startswith("# install git from https://") if not tool else f"{tool} install" in fix
 

@@ -10,7 +10,7 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.ablation_study import plan_study, read_outcomes, report
-from ambiguous_wild.harness.cell import reproduce
+from ambiguous_wild.harness.cell import reproduce_command
 from ambiguous_wild.harness.grid import cell_folder, run_cells
 from ambiguous_wild.harness.result_file import write_result
 from ambiguous_wild.harness.store import read_runs
@@ -234,7 +234,7 @@ def test_a_graft_of_the_method_is_a_row_with_settings(scene):
         cell = names[name]
         assert cell.method.name == f"mine@plug-in-{name}"
         assert (cell.options.density.grow_scale, cell.options.density.grow_grad) == (0.5, grow)
-    command = reproduce(names["with"])
+    command = reproduce_command(names["with"])
     assert "--method 3dgs@density=mine" in command
     assert "--set mine.grow_grad=0.1" in command and "--set mine.grow_scale=0.5" in command
     # without settings it is an ordinary graft, whose runs others share

@@ -22,7 +22,7 @@ from ambiguous_wild.harness.cell import (
     environment,
     installed,
     provenance,
-    reproduce,
+    reproduce_command,
     scene_identity,
 )
 from ambiguous_wild.harness.grid import plan_cells
@@ -176,7 +176,7 @@ def test_the_command_of_a_result_makes_the_same_cell(
 ) -> None:
     train = TrainConfig(iterations=70, seed=3, max_gaussians=900, resolution="full")
     (cell,) = plan_cells([method], [scene], [3], train, settings=settings, **more)
-    assert typed(reproduce(cell)).identity == cell.identity
+    assert typed(reproduce_command(cell)).identity == cell.identity
 
 
 RECIPE = """
@@ -216,7 +216,7 @@ def test_a_method_given_by_reference_is_found_again_from_anywhere(
     (folder / "ext.yaml").write_text(PROGRAM)
     monkeypatch.chdir(tmp_path)
     (cell,) = plan_cells([method], [scene], [0], TrainConfig(iterations=9), settings=[setting])
-    text = reproduce(cell)
+    text = reproduce_command(cell)
     monkeypatch.setattr(registry, "registered", {})  # another process
     monkeypatch.chdir("/")
     assert typed(text).identity == cell.identity
@@ -228,7 +228,7 @@ def test_a_graft_names_the_plugin_of_its_host(scene: Path, tmp_path: Path) -> No
     plugin.write_text(f"{RECIPE}\nregister(MethodEntry('mine', 'of my own', build, config=Config))\n")
     load_plugin(plugin)
     (cell,) = plan_cells(["mine@mask=truth"], [scene], [0], TrainConfig(iterations=9))
-    words = shlex.split(reproduce(cell))
+    words = shlex.split(reproduce_command(cell))
     assert words[words.index("--plugin") + 1 :] == [str(plugin)]
     assert typed(shlex.join(words)).identity == cell.identity
 
@@ -239,7 +239,7 @@ def test_a_variant_of_an_ablation_is_its_method_with_other_settings(scene: Path)
     variant = dataclasses.replace(
         cell, method=dataclasses.replace(cell.method, name="refinesplat@x-y"), options=options
     )
-    assert typed(reproduce(variant)).identity == dataclasses.replace(cell, options=options).identity
+    assert typed(reproduce_command(variant)).identity == dataclasses.replace(cell, options=options).identity
 
 
 def test_budgets_and_plugins_are_part_of_the_command(scene: Path, tmp_path: Path) -> None:
@@ -251,7 +251,7 @@ def test_budgets_and_plugins_are_part_of_the_command(scene: Path, tmp_path: Path
     )
     load_plugin(plugin)
     (cell,) = plan_cells(["mine"], [scene], [0], TrainConfig(budget_s=90.5))
-    words = shlex.split(reproduce(cell))
+    words = shlex.split(reproduce_command(cell))
     assert words[words.index("--plugin") + 1] == str(plugin)
     assert parse_budget(words[words.index("--budget") + 1]) == 90.5 and "--iterations" not in words
 

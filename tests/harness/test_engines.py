@@ -14,9 +14,9 @@ from ambiguous_wild.cli.bench import command as bench
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import job as jobs
 from ambiguous_wild.harness.cell import CellReport, RunOptions
-from ambiguous_wild.harness.cell_run import left_alone
+from ambiguous_wild.harness.cell_run import existing_outcome
 from ambiguous_wild.harness.grid import cell_folder, plan_cells
-from ambiguous_wild.harness.ray_cluster import Sent, receive, run_sent, send_scene
+from ambiguous_wild.harness.ray_cluster import PackedReport, run_sent, send_scene, unpack_report
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.harness.session import run_in_processes
 from ambiguous_wild.io.archive import pack_folder
@@ -190,22 +190,22 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
     (cell,) = plan_cells([f"external:{method}"], [scene], [0], SHORT)
     sources = jobs.read_sources([], [f"external:{method}"])
     job = jobs.make_job(cell, cell_folder(tmp_path / "runs", cell), RunOptions(tmp_path / "c"), sources)
-    assert left_alone(Path(job.folder), "missing", job.config) is None
+    assert existing_outcome(Path(job.folder), "missing", job.config) is None
     key, content = send_scene(scene, 10.0)
     for _ in range(2):  # the second finds the scene unpacked
-        report = receive(run_sent(job, key, content, 10.0), job, 10.0)
+        report = unpack_report(run_sent(job, key, content, 10.0), job, 10.0)
         assert report.outcome == "trained", report.error
     assert report.folder == Path(job.folder)
     assert read_result(report.folder / "metrics.json")["config_hash"] == cell.identity
     assert (report.folder / "renders/test/test_0.png").is_file()
-    assert left_alone(report.folder, "missing", job.config) == "kept"
-    assert left_alone(report.folder, "always", job.config) is None
-    assert left_alone(report.folder, "changed", job.config) == "kept"
-    assert left_alone(report.folder, "changed", {**job.config, "source": "0" * 64}) is None
+    assert existing_outcome(report.folder, "missing", job.config) == "kept"
+    assert existing_outcome(report.folder, "always", job.config) is None
+    assert existing_outcome(report.folder, "changed", job.config) == "kept"
+    assert existing_outcome(report.folder, "changed", {**job.config, "source": "0" * 64}) is None
     assert [p.name for p in (tmp_path / "node").rglob("scene")] == ["scene"]
     assert list((tmp_path / "node").rglob("run-*")) == []
     (report.folder / "notes.txt").write_text("mine")
-    again = receive(run_sent(job, key, content, 10.0), job, 10.0)
+    again = unpack_report(run_sent(job, key, content, 10.0), job, 10.0)
     assert again.outcome == "trained" and (report.folder / "notes.txt").read_text() == "mine"
     (report.folder / "metrics.json").unlink()
     (report.folder / "checkpoint").mkdir()
@@ -214,9 +214,9 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
     for name in ("failed.json", "config.yaml"):
         (node / name).write_text(name)
     (report.folder / "failed.json").write_text("of the attempt before")
-    failed = Sent(CellReport(report.folder, "failed", error="no memory"), pack_folder(node, 1.0))
+    failed = PackedReport(CellReport(report.folder, "failed", error="no memory"), pack_folder(node, 1.0))
     before = (report.folder / "config.yaml").read_bytes()
-    assert receive(failed, job, 10.0).outcome == "failed"
+    assert unpack_report(failed, job, 10.0).outcome == "failed"
     assert (report.folder / "checkpoint").is_dir() and (report.folder / "notes.txt").is_file()
     assert (report.folder / "failed.json").read_text() == "failed.json"
     assert (report.folder / "config.yaml").read_bytes() == before

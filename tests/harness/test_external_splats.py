@@ -17,7 +17,7 @@ from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.external import PACKAGED, load_description, packaged
-from ambiguous_wild.methods.external_process import stage
+from ambiguous_wild.methods.external_process import stage_scene
 from ambiguous_wild.splat.train_config import TrainConfig
 from tests.methods.baselines import parts_of, trained
 from tests.tiny_scene import TEST, TRAIN
@@ -103,7 +103,7 @@ def test_nerfws_folders_hold_the_split_and_full_size(scene, tmp_path):
     for path in (small / "images").iterdir():
         write_png(small / "images_2" / path.name, np.ascontiguousarray(read_png_rgb(path)[::2, ::2]))
     loaded = load_scene(small, factor=2)
-    folder = stage(loaded, tmp_path / "staged", {}, photos="nerf-w")
+    folder = stage_scene(loaded, tmp_path / "staged", {}, photos="nerf-w")
     rows = [row.split("\t") for row in (folder / f"{loaded.name}.tsv").read_text().splitlines()]
     assert rows[0] == ["filename", "id", "split", "dataset"]
     assert {row[0]: row[2] for row in rows[1:]} == dict.fromkeys(TRAIN, "train") | dict.fromkeys(TEST, "test")
@@ -114,7 +114,7 @@ def test_nerfws_folders_hold_the_split_and_full_size(scene, tmp_path):
     )  # which its loader expects
     assert sorted(p.name for p in (folder / "dense/images").iterdir()) == sorted([*TRAIN, *TEST])
     with pytest.raises(AwError, match="--factor 2"):
-        stage(load_scene(small, factor=1), tmp_path / "full", {}, photos="nerf-w")
+        stage_scene(load_scene(small, factor=1), tmp_path / "full", {}, photos="nerf-w")
 
 
 @pytest.mark.parametrize("name", sorted(p.stem for p in PACKAGED.glob("*.yaml")))

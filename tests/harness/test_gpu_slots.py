@@ -125,7 +125,7 @@ def test_the_session_hands_the_gpus_on_and_warns_where_they_are_shared(four_gpus
     given, said, cells = [], [], [FakeCell()] * 9
     monkeypatch.setattr(session, "run_in_processes", lambda *made: given.extend(made) or [])
     monkeypatch.setattr(job, "make_job", lambda *made: None)
-    monkeypatch.setattr("ambiguous_wild.harness.grid.checked_folders", lambda *made: [None] * 9)
+    monkeypatch.setattr("ambiguous_wild.harness.grid.check_run_folders", lambda *made: [None] * 9)
     used = Session(Engine(jobs=jobs), None, Lines(said.append))
     used.in_process(cells)
     used.run(cells, Path(), None)

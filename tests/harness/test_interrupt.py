@@ -12,9 +12,9 @@ from ambiguous_wild.cli import main
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.benchmark import Callbacks, bench
 from ambiguous_wild.harness.store import run_folders
-from ambiguous_wild.harness.trained_models import find_models
+from ambiguous_wild.harness.trained_models import find_run_models
 from ambiguous_wild.io.ply import read_splat_ply
-from ambiguous_wild.splat.training_loop import Stopped, deferred
+from ambiguous_wild.splat.training_loop import Stopped, defer_interrupt
 from tests.tiny_scene import write_tiny_scene
 
 LENGTH = 30
@@ -63,7 +63,7 @@ def test_the_model_is_kept_and_the_same_command_goes_on(tmp_path: Path, scene: P
     assert len(read_splat_ply(kept / "point_cloud.ply")["means"]) > 3
     assert list(run_folders(tmp_path / "runs")) == [run]  # what is kept is no run of its own
     with pytest.raises(AwError, match=f"is not finished: .*its model is {kept / 'point_cloud.ply'}"):
-        find_models([tmp_path / "runs"])
+        find_run_models([tmp_path / "runs"])
 
     (again,) = train(scene, tmp_path / "runs").runs
     (whole,) = train(scene, tmp_path / "whole").runs
@@ -106,13 +106,13 @@ def test_only_the_main_thread_and_the_default_answer_are_touched() -> None:
 
     before = signal.signal(signal.SIGINT, other)
     try:
-        with deferred() as interrupted:
+        with defer_interrupt() as interrupted:
             assert signal.getsignal(signal.SIGINT) is other and not interrupted()
     finally:
         signal.signal(signal.SIGINT, before)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with deferred() as interrupted:
+        with defer_interrupt() as interrupted:
             signal.raise_signal(signal.SIGINT)
             assert interrupted()
             with pytest.raises(KeyboardInterrupt):

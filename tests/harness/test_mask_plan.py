@@ -11,16 +11,16 @@ import torch
 from ambiguous_wild.harness.effects_plan import Evidence, decide
 from ambiguous_wild.harness.mask_plan import (
     CERTAIN,
-    HELD_BACK,
+    HELD_OUT_SHARE,
     MASK_LINES,
     MIN_DB,
     MIN_PHOTOS,
-    Gain,
+    MaskComparison,
+    MaskingGain,
     Occlusion,
-    Pair,
-    compare,
-    held_back,
-    sampled,
+    held_out_blocks,
+    masking_gain,
+    sample_photos,
     with_gain,
     with_occlusion,
     without_blocks,
@@ -37,21 +37,25 @@ def psnr(*values):
 
 
 def test_a_gain_is_the_mean_over_photos_and_its_standard_error():
-    gain = compare(psnr(21.0, 22.0, 23.0, 24.0), psnr(20.0, 22.0, 22.0, 22.0))  # differences 1, 0, 1, 2
+    gain = masking_gain(psnr(21.0, 22.0, 23.0, 24.0), psnr(20.0, 22.0, 22.0, 22.0))  # differences 1, 0, 1, 2
     assert gain.db == pytest.approx(1.0)
     assert gain.error_db == pytest.approx(math.sqrt(2 / 3) / 2)
-    assert compare(psnr(*[20.0] * (MIN_PHOTOS - 1)), psnr(*[20.0] * 9)) is None
+    assert masking_gain(psnr(*[20.0] * (MIN_PHOTOS - 1)), psnr(*[20.0] * 9)) is None
 
 
 def test_masks_are_off_where_leaving_the_patches_out_does_not_pay():
     plan = with_occlusion(PLAN, Occlusion(0.02, 0.02, 0.1))
-    for gain, answer in ((Gain(0.2, 0.05), "on"), (Gain(0.01, 0.005), "off"), (Gain(0.1, 0.2), "off")):
+    for gain, answer in (
+        (MaskingGain(0.2, 0.05), "on"),
+        (MaskingGain(0.01, 0.005), "off"),
+        (MaskingGain(0.1, 0.2), "off"),
+    ):
         found = {d.effect: d for d in with_gain(plan, gain).decisions}
         assert {found[name].decision for name in MASK_LINES} == {answer}
         assert found["masks"].gain_db == gain.db
     assert with_gain(plan, None) == plan
     much = with_occlusion(PLAN, Occlusion(2 * CERTAIN, 0.02, 0.1))
-    found = with_gain(much, Gain(-0.1, 0.05)).decisions[0]
+    found = with_gain(much, MaskingGain(-0.1, 0.05)).decisions[0]
     assert found.decision == "on" and found.gain_db == -0.1
 
 
@@ -61,23 +65,23 @@ def scene(tmp_path_factory):
 
 
 def test_blocks_are_a_share_of_every_photo_and_not_under_its_mask(scene, tmp_path):
-    bench = Pair(scene, tmp_path)
+    bench = MaskComparison(scene, tmp_path)
     for block in bench.blocks:
-        assert block.double().mean().item() == pytest.approx(HELD_BACK, abs=0.06)
-    again, other = held_back(bench.data, 0), held_back(bench.data, 1)
+        assert block.double().mean().item() == pytest.approx(HELD_OUT_SHARE, abs=0.06)
+    again, other = held_out_blocks(bench.data, 0), held_out_blocks(bench.data, 1)
     assert all(torch.equal(a, b) for a, b in zip(bench.blocks, again))
     assert not all(torch.equal(a, b) for a, b in zip(bench.blocks, other))
     keep = torch.ones(bench.blocks[0].shape)
     keep[:, :32] = 0
     masked = dataclasses.replace(bench.data, user_keep=[keep] * 6)
-    assert not any(block[:, :32].any() for block in held_back(masked, 0))
+    assert not any(block[:, :32].any() for block in held_out_blocks(masked, 0))
 
 
 def test_nothing_of_the_blocks_is_learnt(scene, tmp_path, monkeypatch):
     kept = []
 
     def gaussians(change):
-        bench = Pair(scene, tmp_path)
+        bench = MaskComparison(scene, tmp_path)
         if change:
             for photo, block in zip(bench.data.photos, bench.blocks):
                 photo[block] = 1 - photo[block]
@@ -108,10 +112,10 @@ def test_points_say_nothing_of_held_back_pixels():
 def test_a_long_capture_is_sampled_evenly():
     found = synthetic()[0]
     many = dataclasses.replace(found, views=found.views * 10)
-    few, places = sampled(many)
+    few, places = sample_photos(many)
     assert len(few.train) == len(places) == 60 and places[0] == 0 and places[-1] == 119
     assert set(np.diff(places)) <= {2, 3}
-    assert sampled(found) == (found, list(range(12)))
+    assert sample_photos(found) == (found, list(range(12)))
 
 
 def test_leaving_distractors_out_helps_and_leaving_the_scene_out_harms(scene, tmp_path):
@@ -120,9 +124,9 @@ def test_leaving_distractors_out_helps_and_leaving_the_scene_out_harms(scene, tm
     patches = [torch.from_numpy(patch) for patch in truth]
 
     def gain(found):
-        bench = Pair(found, tmp_path)
+        bench = MaskComparison(found, tmp_path)
         arms = [bench.train((), patches, masked, lambda: None, 120) for masked in (True, False)]
-        return compare(*arms)
+        return masking_gain(*arms)
 
     static, spoilt = gain(scene), gain(load_scene(root))
     assert static.db < MIN_DB and static.db < 0 < spoilt.db

@@ -16,7 +16,7 @@ from ambiguous_wild.harness.grid import plan_cells, run_cells
 from ambiguous_wild.harness.meter import ActiveRuns, Meter
 from ambiguous_wild.harness.timing import in_reference_seconds
 from ambiguous_wild.io.scene_folder import load_scene
-from ambiguous_wild.splat.calibration import KERNELS, Calibration, Reading, Size
+from ambiguous_wild.splat.calibration import KERNELS, Calibration, CalibrationResult, KernelSize
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.method_hooks import MethodHooks
@@ -45,13 +45,13 @@ class Machine:
 def meter(tmp_path: Path, *, kernel: list[float] | None = None, threads: int = CORES) -> Meter:
     seconds = iter(kernel or [0.5] * 100)
     presence = ActiveRuns("cpu", tmp_path)
-    return Meter("cpu", threads, read=lambda: Reading(next(seconds)), presence=presence)
+    return Meter("cpu", threads, read=lambda: CalibrationResult(next(seconds)), presence=presence)
 
 
 def measured(m: Meter, m_work, seconds: float = 40.0, **how: float) -> tuple[str, str]:
     m.begin(0.0)
     m_work(seconds, **how)
-    m.look(seconds)
+    m.calibrate(seconds)
     m.end()
     return m.verdict(seconds)
 
@@ -77,7 +77,7 @@ def test_a_load_that_others_brought_once_is_not_forgotten(tmp_path, monkeypatch)
     m.begin(0.0)
     for k in range(4):
         here.work(10.0, others=2.0 if k == 0 else 0.0)
-        m.look(10.0 * (k + 1))
+        m.calibrate(10.0 * (k + 1))
     m.end()
     assert m.verdict(40.0) == ("contended", "other programs used 0.5 of 4 processors")
 
@@ -86,7 +86,7 @@ def sampled(m: Meter, here: Machine, seconds: int) -> tuple[str, str]:
     m.begin(0.0)
     for k in range(1, seconds + 1):
         here.work(1.0)
-        m.look(float(k))
+        m.calibrate(float(k))
     m.end()
     return m.verdict(float(seconds))
 
@@ -106,7 +106,7 @@ def test_a_run_that_was_calibrated_late_is_unknown(tmp_path, monkeypatch):
     here, m = Machine(monkeypatch), meter(tmp_path)
     m.begin(30.0)
     here.work(10.0)
-    m.look(40.0)
+    m.calibrate(40.0)
     assert m.verdict(40.0) == ("unknown", "calibrations cover 25 % of the training")
 
 
@@ -129,11 +129,11 @@ def test_load_slows_what_is_serial_less_and_cancels_out(tmp_path, monkeypatch, p
     for one, two in ((1.0, 2.0), (2 / 3, 1.0)):
         here = Machine(monkeypatch)
         wall = (30.0 - parallel_s) / one + parallel_s * 2.0 / two
-        reading = Reading(kernel.reference_s * 2.0 / two, two, kernel.serial_reference_s / one, one)
+        reading = CalibrationResult(kernel.reference_s * 2.0 / two, two, kernel.serial_reference_s / one, one)
         m = Meter("cpu", 2, read=lambda r=reading: r, presence=ActiveRuns("cpu", tmp_path))
         m.begin(0.0)
         here.wall, here.own = here.wall + wall, here.own + 30.0 + parallel_s
-        m.look(wall)
+        m.calibrate(wall)
         m.end()
         cost = m.cost(wall)
         # busy, the same work in parallel is a larger share of the time
@@ -146,14 +146,14 @@ def test_load_slows_what_is_serial_less_and_cancels_out(tmp_path, monkeypatch, p
 def test_a_run_of_one_thread_needs_no_second_kernel(tmp_path, monkeypatch):
     here = Machine(monkeypatch)
     kernel = KERNELS["cpu"]
-    reading = Reading(kernel.reference_s, 1.0, 9.0, 1.0)
+    reading = CalibrationResult(kernel.reference_s, 1.0, 9.0, 1.0)
     m = Meter("cpu", 1, read=lambda: reading, presence=ActiveRuns("cpu", tmp_path))
     measured(m, here.work, 40.0, threads=1)
     assert m.cost(40.0)["reference_s"] == pytest.approx(40.0)
 
 
 def test_the_kernel_is_read_on_all_threads_and_on_one():
-    size = Size("test", 1.0, 200, 48, 32, 3, 1, 1.0)
+    size = KernelSize("test", 1.0, 200, 48, 32, 3, 1, 1.0)
     before = threads()
     reading = Calibration(torch.device("cpu"), size).read()
     assert reading.seconds > 0.0 and reading.serial_s is not None and reading.serial_s > 0.0
@@ -167,7 +167,7 @@ def test_calibrations_come_often_at_first_and_every_fifteen_seconds_later(tmp_pa
         m.begin(0.0)
         for k in range(1, round(total / step) + 1):
             if m.due(k * step, k * step / total):
-                m.look(k * step)
+                m.calibrate(k * step)
         m.end()
         times = [sample[0] for sample in m.samples]
         assert fewest <= len(times) <= most
@@ -179,7 +179,7 @@ def test_the_state_of_a_meter_goes_on_after_a_kill(tmp_path, monkeypatch):
     here, m = Machine(monkeypatch), meter(tmp_path)
     m.begin(0.0)
     here.work(20.0, others=2.0)
-    m.look(20.0)
+    m.calibrate(20.0)
     here.work(10.0, others=2.0)
     state = m.state_dict()
     m.end()
@@ -187,7 +187,7 @@ def test_the_state_of_a_meter_goes_on_after_a_kill(tmp_path, monkeypatch):
     other.load_state_dict(state)
     other.begin(30.0)
     here.work(10.0)
-    other.look(40.0)
+    other.calibrate(40.0)
     other.end()
     assert other.verdict(40.0) == ("contended", "other programs used 1.5 of 4 processors")
     assert [sample[0] for sample in other.samples] == [0.0, 20.0, 30.0, 40.0]
@@ -198,11 +198,11 @@ def test_a_rollback_keeps_what_was_spent_and_seen(tmp_path, monkeypatch):
     before_the_run = m.state_dict()
     m.begin(0.0)
     here.work(20.0, others=2.0)
-    m.look(20.0)
+    m.calibrate(20.0)
     m.load_state_dict(before_the_run)
     assert not m.due(20.5, 0.5)
     here.work(20.0)
-    m.look(40.0)
+    m.calibrate(40.0)
     assert m.verdict(40.0) == ("contended", "other programs used 1.0 of 4 processors")
 
 
@@ -256,7 +256,7 @@ def test_what_the_system_does_not_tell_is_unknown(tmp_path, monkeypatch):
 
 
 def test_the_kernel_does_the_same_work_every_time():
-    kernel = Calibration(torch.device("cpu"), Size("test", 1.0, 200, 48, 32, 3))
+    kernel = Calibration(torch.device("cpu"), KernelSize("test", 1.0, 200, 48, 32, 3))
     before = {name: tensor.clone() for name, tensor in kernel.gaussians.items()}
     assert kernel.seconds() > 0.0
     assert kernel.seconds() > 0.0
@@ -272,7 +272,7 @@ def test_a_meter_changes_no_bit_of_a_run(scene, tmp_path):
             trainer.meter = meter(tmp_path, kernel=[1.0] * 100)
             monitored = trainer.meter
             monitored.due = lambda trained_s, progress: True  # after every iteration
-            kernel = Calibration(torch.device("cpu"), Size("test", 1.0, 200, 48, 32, 1))
+            kernel = Calibration(torch.device("cpu"), KernelSize("test", 1.0, 200, 48, 32, 1))
             monitored._read = kernel.read
         train(trainer)
         found.append({k: v.numpy().tobytes() for k, v in trainer.gaussians.items()})

@@ -15,10 +15,10 @@ from ambiguous_wild.harness.pictures import (
     CELL,
     MOMENTS,
     ROWS,
-    Recorder,
+    TrainingPictures,
     draw_all,
     draw_density,
-    strip,
+    picture_row,
 )
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.palette import ramp
@@ -59,7 +59,7 @@ def watched(scene, tmp_path_factory):
     """A run with pictures: (trainer, folder, what was written)."""
     folder = tmp_path_factory.mktemp("runs") / "watched"
     trainer = trainer_for(scene, folder)
-    recorder = Recorder(trainer, folder)
+    recorder = TrainingPictures(trainer, folder)
     train(trainer, tick=recorder)
     return trainer, folder, draw_all(trainer, recorder, folder)
 
@@ -86,7 +86,7 @@ def test_every_picture_is_there_a_row_a_moment(watched):
 
 def test_a_run_that_stopped_has_the_pictures_of_one_that_did_not(scene, watched, tmp_path):
     first = trainer_for(scene, tmp_path)
-    recorder = Recorder(first, tmp_path)
+    recorder = TrainingPictures(first, tmp_path)
     while first.iteration < 71:
         first.step()
         recorder(first)
@@ -94,7 +94,7 @@ def test_a_run_that_stopped_has_the_pictures_of_one_that_did_not(scene, watched,
             first.save()  # what comes later is lost
     second = trainer_for(scene, tmp_path)
     assert second.resume() and second.iteration == 40
-    recorder = Recorder(second, tmp_path)
+    recorder = TrainingPictures(second, tmp_path)
     train(second, tick=recorder)
     draw_all(second, recorder, tmp_path)
     for name in ("training_train_0.png", "training_train_5.png"):
@@ -105,13 +105,13 @@ def test_a_run_that_stopped_has_the_pictures_of_one_that_did_not(scene, watched,
 def test_looking_costs_no_training_time(watched):
     trainer, _, _ = watched
     before = dict(trainer.clock.parts_s), trainer.clock.now()
-    strip(trainer, 1)
+    picture_row(trainer, 1)
     assert (dict(trainer.clock.parts_s), trainer.clock.now()) == before
 
 
 def test_pictures_grow_while_any_method_trains(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path, MethodHooks())  # no masks, so no panels of a method
-    recorder = Recorder(trainer, tmp_path)
+    recorder = TrainingPictures(trainer, tmp_path)
     heights = []
     while trainer.iteration < 0.25 * trainer.config.iterations:
         trainer.step()
@@ -141,7 +141,7 @@ def test_pictures_can_be_left_away(scene, tmp_path):
 def test_the_log_of_density_control_adds_up(watched):
     trainer, _, _ = watched
     rounds = trainer.density.log.rounds
-    count = trainer.pace.start
+    count = trainer.run_schedule.start
     for r in rounds:
         count += r.cloned + r.split - r.pruned - r.merged
         assert r.count == count

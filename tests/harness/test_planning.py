@@ -13,17 +13,17 @@ from ambiguous_wild.core import AwError, Camera, Scene, SparsePoints, View
 from ambiguous_wild.harness import effects_plan, mask_plan
 from ambiguous_wild.harness import effects_plan as decide_module
 from ambiguous_wild.harness.cell import RunOptions, scene_identity
-from ambiguous_wild.harness.chosen_effects import check_wanted
+from ambiguous_wild.harness.chosen_effects import parse_effects
 from ambiguous_wild.harness.effects_plan import (
     FEW_PHOTOS,
     OUTWARD,
     EffectsPlan,
     decide,
-    measure,
+    measure_evidence,
     plan_effects,
     read_plan,
 )
-from ambiguous_wild.harness.grid import cell_folder, choose, plan_cells, run_cells
+from ambiguous_wild.harness.grid import cell_folder, choose_effects, plan_cells, run_cells
 from ambiguous_wild.harness.mask_plan import Occlusion, residual_mask, summarise, with_occlusion
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.scene_folder import load_scene
@@ -82,7 +82,7 @@ def synthetic(*, exposure=0.0, place=0.0, zoom=1.0, shine=0.0, seed=0):
 
 def measured(**kw):
     """As of many photos; here are few, to be quick."""
-    return dataclasses.replace(measure(*synthetic(**kw)), photos=FEW_PHOTOS + 1)
+    return dataclasses.replace(measure_evidence(*synthetic(**kw)), photos=FEW_PHOTOS + 1)
 
 
 def decisions(**kw):
@@ -119,7 +119,7 @@ def test_few_photos_call_for_a_dense_start(photos, answer):
     assert [d.decision for d in plan.decisions if d.effect == "dense"] == [answer]
     assert plan.effects() == (("dense",) if answer == "on" else ("skybox",))
     assert (
-        choose("auto", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"].effects
+        choose_effects("auto", synthetic()[0], [get_method("refinesplat")], plan)["refinesplat"].effects
         == plan.effects()
     )
 
@@ -142,7 +142,7 @@ def test_a_dense_start_takes_the_room_of_a_skybox():
 def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():
     scene, photos = synthetic()
     turned = np.diag([-1.0, 1.0, -1.0, 1.0])  # each camera looks back, at points mirrored in its centre
-    assert measure(scene, photos).outward < 0.2
+    assert measure_evidence(scene, photos).outward < 0.2
     views, xyz = [], []
     for view in scene.views:
         camera = dataclasses.replace(view.camera, cam_from_world=turned @ view.camera.cam_from_world)
@@ -154,8 +154,8 @@ def test_cameras_around_a_thing_look_inward_and_those_in_its_middle_outward():
         np.repeat(np.arange(len(views)), 5).astype(np.int32), np.zeros((count, 2), np.float32),
     )  # fmt: skip
     scene = dataclasses.replace(scene, views=tuple(views), points=points)
-    assert effects_plan.outward(scene) > OUTWARD
-    assert math.isnan(effects_plan.outward(dataclasses.replace(scene, views=tuple(views[:2]))))
+    assert effects_plan.outward_ratio(scene) > OUTWARD
+    assert math.isnan(effects_plan.outward_ratio(dataclasses.replace(scene, views=tuple(views[:2]))))
 
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-4])
@@ -169,7 +169,7 @@ def test_cameras_at_one_place_look_neither_inward_nor_outward(jitter):
         camera = dataclasses.replace(view.camera, cam_from_world=pose)
         views.append(dataclasses.replace(view, camera=camera))
     found = dataclasses.replace(
-        measured(), outward=effects_plan.outward(dataclasses.replace(scene, views=tuple(views)))
+        measured(), outward=effects_plan.outward_ratio(dataclasses.replace(scene, views=tuple(views)))
     )
     assert math.isnan(found.outward)
     assert decide("dots", found).effects() == ("skybox",)
@@ -181,9 +181,9 @@ def test_what_stands_before_points_is_no_light_that_differs_by_place(monkeypatch
     for photo in photos:  # a fourteenth of each is covered
         row, column = rng.integers(0, HEIGHT - 25), rng.integers(0, WIDTH - 40)
         photo[row : row + 25, column : column + 40] = rng.uniform(0.1, 0.9, 3)
-    assert measure(scene, photos).appearance < decide_module.APPEARANCE / 2
+    assert measure_evidence(scene, photos).appearance < decide_module.APPEARANCE / 2
     monkeypatch.setattr(effects_plan, "OUTLYING", math.inf)
-    assert measure(scene, photos).appearance > decide_module.APPEARANCE
+    assert measure_evidence(scene, photos).appearance > decide_module.APPEARANCE
 
 
 @pytest.mark.parametrize("changed", [2, 3, 4, 8])
@@ -191,12 +191,12 @@ def test_light_of_few_photos_is_not_taken_for_what_stands_before_points(changed)
     (scene, photos), (_, relit) = synthetic(), synthetic(place=0.4)
     for k in np.linspace(0, VIEWS - 1, changed).astype(int):
         photos[k] = relit[k]
-    assert measure(scene, photos).appearance > 1.3 * decide_module.APPEARANCE
+    assert measure_evidence(scene, photos).appearance > 1.3 * decide_module.APPEARANCE
 
 
 def test_the_numbers_are_what_was_put_in():
-    assert measure(*synthetic(exposure=0.15)).exposure == pytest.approx(0.15, rel=0.35)
-    assert measure(*synthetic(zoom=3.0)).sampling == pytest.approx(3.0 ** (0.9), rel=0.1)
+    assert measure_evidence(*synthetic(exposure=0.15)).exposure == pytest.approx(0.15, rel=0.35)
+    assert measure_evidence(*synthetic(zoom=3.0)).sampling == pytest.approx(3.0 ** (0.9), rel=0.1)
 
 
 def test_a_scene_without_tracks_reads_no_photo_and_says_unknown():
@@ -273,11 +273,11 @@ def test_what_stands_out_must_stay_when_a_longer_probe_has_learnt_the_rest(monke
 
 
 def test_words_and_lists():
-    assert check_wanted("auto") == check_wanted("none") == ()
-    assert check_wanted("poses, exposure") == ("exposure", "poses")
+    assert parse_effects("auto") == parse_effects("none") == ()
+    assert parse_effects("poses, exposure") == ("exposure", "poses")
     for wrong, message in (("auto,poses", "be combined"), (" , ", "is empty"), ("exposur", "did you mean")):
         with pytest.raises(AwError, match=message):
-            check_wanted(wrong)
+            parse_effects(wrong)
 
 
 def test_every_method_that_can_takes_the_effects_of_the_scene():
@@ -285,13 +285,13 @@ def test_every_method_that_can_takes_the_effects_of_the_scene():
     plan = decide("dots", measured(zoom=3.0, exposure=0.15))
     methods = [get_method(name) for name in ("3dgs", "refinesplat", "refinesplat@mask=truth")]
     program = dataclasses.replace(get_method("3dgs"), name="theirs", program=object())
-    chosen = choose("auto", scene, [*methods, program], plan)
+    chosen = choose_effects("auto", scene, [*methods, program], plan)
     assert {chosen[m.name].effects for m in methods} == {("exposure", "antialias", "skybox")}
     assert chosen["theirs"].effects == () and not chosen["theirs"].asked
-    assert choose("poses", scene, [*methods, program], plan)["theirs"].effects == ()
-    assert {c.effects for c in choose("none", scene, methods, plan).values()} == {()}
+    assert choose_effects("poses", scene, [*methods, program], plan)["theirs"].effects == ()
+    assert {c.effects for c in choose_effects("none", scene, methods, plan).values()} == {()}
     with pytest.raises(AwError, match="of scene dots, not of other"):
-        choose("auto", dataclasses.replace(scene, name="other"), methods, plan)
+        choose_effects("auto", dataclasses.replace(scene, name="other"), methods, plan)
 
 
 SHORT = TrainConfig(iterations=40, probes=0)
@@ -334,7 +334,7 @@ def test_a_run_says_what_was_on_and_why_and_ships_the_filtered_model(scene, tmp_
 
 def test_options_are_checked_before_a_plan_is_made(tmp_path, monkeypatch):
     scene = write_tiny_scene(tmp_path / "scene")
-    monkeypatch.setattr("ambiguous_wild.harness.grid.choose", pytest.fail)
+    monkeypatch.setattr("ambiguous_wild.harness.grid.choose_effects", pytest.fail)
     with pytest.raises(AwError, match="most is at least 0, got -1"):
         plan_cells(
             ["refinesplat"], [scene], [0], TrainConfig(),

@@ -82,5 +82,5 @@ def test_the_plug_in_table_has_a_row_a_threshold(scene, method, group):
 def test_the_density_table_puts_other_density_controls_in_refinesplat(scene):
     study = plan_study("refinesplat", [scene], [0], TrainConfig(iterations=5), groups=["density-control"])
     built = [row.cells[0].method.build(row.cells[0].options) for row in study.rows]
-    assert [parts.density.__name__ for parts in built[1:]] == ["PupDensity", "UncertaintyAware"]
+    assert [parts.density.__name__ for parts in built[1:]] == ["PupDensity", "UncertaintyAwareDensity"]
     assert type(built[1].mask) is type(built[0].mask)

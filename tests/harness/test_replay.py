@@ -14,7 +14,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness import replay as replay_module
 from ambiguous_wild.harness.cell_run import OURS
 from ambiguous_wild.harness.grid import cell_folder, plan_cells, run_cells
-from ambiguous_wild.harness.replay import open_run, replay
+from ambiguous_wild.harness.replay import open_run, replay_run
 from ambiguous_wild.harness.result_file import read_result
 from ambiguous_wild.io.images import read_keep_map, read_png_rgb, write_png
 from ambiguous_wild.io.mask_reasons import read_reasons
@@ -50,8 +50,8 @@ def test_the_same_value_is_found_again_and_the_run_is_left_alone(run):
     assert "gradient of" in report.error
     assert "aw stress --replay" in report.error
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    again = replay(folder)
-    assert again.same
+    again = replay_run(folder)
+    assert again.matches
     assert again.started_at == 0
     assert before == {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     done = CliRunner().invoke(cli, ["stress", "--replay", str(folder)])
@@ -68,14 +68,14 @@ def test_a_rollback_is_a_fact_of_the_result(run):
 
 def test_a_run_without_findings_is_named(tmp_path):
     with pytest.raises(AwError, match="all its values were finite"):
-        replay(tmp_path)
+        replay_run(tmp_path)
 
 
 def test_a_damaged_report_is_named(run):
     folder, _ = run("stop")
     (folder / "nonfinite" / "000009" / "report.json").write_text("[]")
     with pytest.raises(AwError, match="is damaged"):
-        replay(folder)
+        replay_run(folder)
 
 
 def test_a_parameter_found_before_saving_is_found_again(run):
@@ -90,8 +90,8 @@ def test_a_parameter_found_before_saving_is_found_again(run):
     folder, report = run("stop", "late")
     assert report.outcome == "failed"
     assert "parameter of log_scales" in report.error
-    again = replay(folder)
-    assert again.same, again
+    again = replay_run(folder)
+    assert again.matches, again
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from ambiguous_wild.harness import evaluate
 from ambiguous_wild.harness.benchmark import Callbacks, bench
 from ambiguous_wild.harness.measures import ImageRow, measure_images, metrics
 from ambiguous_wild.harness.result_file import metrics_of, read_result
-from ambiguous_wild.harness.store import could_be_measured
+from ambiguous_wild.harness.store import computable_metrics
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.metrics import lpips
 from ambiguous_wild.report.rescore import rescore
@@ -184,7 +184,7 @@ def test_bench_says_that_kept_runs_could_be_rescored(
     (again := Said()).say("")
     report = bench("3dgs", scene, callbacks=again, **words)
     assert f"lack lpips_alex, which can be measured now: aw rescore {tmp_path / 'runs'}" in again.lines[-1]
-    assert could_be_measured([report.runs[0].result]) == ["lpips_alex"]
+    assert computable_metrics([report.runs[0].result]) == ["lpips_alex"]
     assert bench_module._rescore_hint(report)
 
 
@@ -211,9 +211,9 @@ def test_photos_too_small_for_a_network_leave_it_out(monkeypatch: pytest.MonkeyP
 
 def test_what_is_too_small_is_no_case_for_rescore(tmp_path: Path, scene: Path, weights: None) -> None:
     result = read_result(write_run(tmp_path / "runs", scene) / "metrics.json")
-    assert "lpips_alex" in could_be_measured([result])
+    assert "lpips_alex" in computable_metrics([result])
     result["missing"]["lpips_alex"] = f"image of 20x12 px is {lpips.TOO_SMALL} with alexnet: ..."
-    assert "lpips_alex" not in could_be_measured([result])
+    assert "lpips_alex" not in computable_metrics([result])
 
 
 def test_networks_use_the_threads_of_the_kernels_and_give_them_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import torch
 from ambiguous_wild import bench
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.harness import training as passes
-from ambiguous_wild.harness.run_cost import both_passes
+from ambiguous_wild.harness.run_cost import two_pass_cost
 from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.methods.given_masks import FixedMasks
@@ -114,7 +114,7 @@ def test_costs_of_both_by_hand():
         "train_s": 15.0, "iterations": 300, "ms_per_iteration": 50.0, "ms_parts": {"loss": 4.0},
         "peak_rss_mb": 400.0, "gaussians": 9,
     }  # fmt: skip
-    found = both_passes(one, other)
+    found = two_pass_cost(one, other)
     assert found["train_s"] == 25.0 and found["setup_s"] == 2.0 and found["iterations"] == 400
     assert found["ms_per_iteration"] == pytest.approx(62.5)
     assert found["ms_parts"] == pytest.approx({"mask": 2.0, "loss": 3.0})

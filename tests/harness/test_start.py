@@ -12,10 +12,10 @@ import pytest
 from ambiguous_wild import bench
 from ambiguous_wild.core import AwError, SparsePoints
 from ambiguous_wild.harness.benchmark import Callbacks
-from ambiguous_wild.harness.cell import RunOptions, reproduce
+from ambiguous_wild.harness.cell import RunOptions, reproduce_command
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.harness.job import make_cell, make_job
-from ambiguous_wild.harness.start import start_file, started
+from ambiguous_wild.harness.start import start_file, with_start
 from ambiguous_wild.io.ply import write_point_ply
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.io.splat_files import FORMATS, write_splats
@@ -40,7 +40,7 @@ class Heard(Callbacks):
         self.lines.append(text)
 
     def tick(self, trainer) -> None:
-        self.starts.append(trainer.pace.start)
+        self.starts.append(trainer.run_schedule.start)
 
 
 def wall_points(path: Path, count: int, shift: float | np.ndarray = 0.0) -> Path:
@@ -89,11 +89,11 @@ def test_a_start_is_in_the_coordinates_of_the_files(tmp_path, kind, shift, scale
     arrays = {**wall, "means": inner.astype(np.float32), "log_scales": sizes}
     if kind == "points":
         write_point_ply(path, true, np.zeros((2500, 3), np.uint8))
-        xyz, _ = started(MethodHooks(), start_file(path), scene).given
+        xyz, _ = with_start(MethodHooks(), start_file(path), scene).user_start
         np.testing.assert_allclose(xyz, inner, atol=1e-3)
         return
     write_splats(FORMATS[kind], path, arrays, scene.transform)
-    parts = started(MethodHooks(sh_degree=2), start_file(path), scene)
+    parts = with_start(MethodHooks(sh_degree=2), start_file(path), scene)
     found = parts.first_gaussians(type("Data", (), {"device": "cpu"})())
     assert isinstance(found, Gaussians) and found.sh_rest.shape == (2500, 8, 3)
     camera = scene.test[0].camera
@@ -109,10 +109,10 @@ def test_a_start_travels_with_its_cell_and_a_file_that_changed_is_refused(scene,
     (cell,) = plan_cells(["3dgs"], [scene], [0], TrainConfig(iterations=3), start=dense)
     there = make_cell(make_job(cell, tmp_path / "run", RunOptions(tmp_path)))
     assert there.start == cell.start and there.identity == cell.identity
-    assert f"--start {dense}" in reproduce(cell)
+    assert f"--start {dense}" in reproduce_command(cell)
     wall_points(dense, 901)
     with pytest.raises(AwError, match="has changed since"):
-        started(MethodHooks(), cell.start, cell.scene)
+        with_start(MethodHooks(), cell.start, cell.scene)
 
 
 def test_what_a_run_cannot_start_from_is_refused_before_anything_is_made(scene, tmp_path):
@@ -139,19 +139,19 @@ def test_a_start_that_lies_near_few_points_of_the_scene_is_warned_of(scene, tmp_
     moved = np.where(np.arange(len(xyz))[:, None] % 40, xyz - np.array([0, 0, 2.0]), xyz)
     write_point_ply(tmp_path / "other.ply", moved, np.zeros(moved.shape, np.uint8))
     with pytest.warns(UserWarning, match="at most [2-9]% of its points .* is it of another scene"):
-        started(MethodHooks(), start_file(tmp_path / "other.ply"), given)
+        with_start(MethodHooks(), start_file(tmp_path / "other.ply"), given)
 
 
 def test_a_start_may_cover_a_part_of_the_scene_alone(scene, tmp_path):
     wall = wall_model(900)["means"]
     part = wall[wall[:, 0] < -1.5]
     write_point_ply(tmp_path / "part.ply", part, np.zeros(part.shape, np.uint8))
-    xyz, _ = started(MethodHooks(), start_file(tmp_path / "part.ply"), load_scene(scene)).given
+    xyz, _ = with_start(MethodHooks(), start_file(tmp_path / "part.ply"), load_scene(scene)).user_start
     assert 4 < len(xyz) < 300
 
 
 def test_a_start_is_not_compared_with_the_few_dummy_points_of_a_scene(scene, tmp_path):
     given = load_scene(scene)
     dummy = replace(given, points=SparsePoints.without_tracks(np.full((1, 3), -50.0)))
-    xyz, _ = started(MethodHooks(), start_file(wall_points(tmp_path / "wall.ply", 900)), dummy).given
+    xyz, _ = with_start(MethodHooks(), start_file(wall_points(tmp_path / "wall.ply", 900)), dummy).user_start
     assert len(xyz) == 900

@@ -8,17 +8,17 @@ import pytest
 import torch
 
 from ambiguous_wild.methods import gsw as gs_w
-from ambiguous_wild.methods.gsw import GswAppearance, GswConfig, Visibility
+from ambiguous_wild.methods.gsw import GswAppearance, GswConfig, VisibilityMask
 from ambiguous_wild.methods.masking_common import d_keep
-from ambiguous_wild.methods.splatfactow import SplatfactoDensity, trimmed
+from ambiguous_wild.methods.splatfactow import SplatfactoDensity, trimmed_keep
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.autograd_effect import Visible
+from ambiguous_wild.splat.effects.autograd_effect import VisibleGaussians
 from ambiguous_wild.splat.effects.geometry import (
     directions,
     frequencies,
     harmonics,
     in_picture,
-    mean_of_seen,
+    mean_of_visible,
     projected,
     ray_directions,
     with_penalty,
@@ -124,7 +124,7 @@ def visible_of(effect, n=5):
     g = gaussians(n=n, rest=3)
     g.means.copy_(torch.tensor([0.0, 0.0, 4.0]) + 0.5 * (random(n, 3) - 0.5))
     extra = {name: row.values for name, row in effect.rows(g).items()}
-    return Visible(torch.zeros(n, 3), g.means, extra)
+    return VisibleGaussians(torch.zeros(n, 3), g.means, extra)
 
 
 def test_colours_by_a_second_implementation(gsw):
@@ -135,7 +135,7 @@ def test_colours_by_a_second_implementation(gsw):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(effect, "config", replace(effect.config, residual=False))
         published = effect.forward(visible, leaf, context)
-    maps = gs_w.maps_of(data.photos[0], leaf, 32).numpy()
+    maps = gs_w.feature_maps(data.photos[0], leaf, 32).numpy()
     assert maps.shape[:2] == (3, 16)
 
     def bilinear(grid, x, y):
@@ -186,7 +186,7 @@ def test_without_a_photo_a_gaussian_samples_what_it_does_in_the_photos_that_show
         pixels, z = projected(visible.means, view)
         at = pixels / torch.tensor([view.width, view.height])
         shown = ((z > 0) & (at > 0).all(1) & (at < 1).all(1)).float()[:, None]
-        map_ = gs_w.maps_of(photo, leaf, 32)[2]
+        map_ = gs_w.feature_maps(photo, leaf, 32)[2]
         total, count = total + shown * gs_w.sample(map_, 2.0 * at - 1.0), count + shown
     assert count.min() >= 1 and count.max() > 1
     torch.testing.assert_close(found, total / count)
@@ -230,7 +230,7 @@ def test_a_test_photo_shows_its_left_half_and_nothing_is_fitted(gsw):
 def test_masks_settle_where_residual_and_prior_balance(gsw):
     """Without SSIM the optimum is M = 1 - 2.67 e; with it the gradient is that of the whole loss."""
     data, effect = gsw
-    policy = Visibility(effect)
+    policy = VisibilityMask(effect)
     step, mask = step_of(data, 0, data.photos[0] * 0.5), random(48, 64)
     found = policy.d_mask(step, mask)
 
@@ -248,10 +248,10 @@ def test_masks_settle_where_residual_and_prior_balance(gsw):
 def test_what_is_trimmed_by_hand():
     error = torch.zeros(20, 20)
     error[5, 5], error[14:18, 14:18] = 0.9, 0.8
-    keep = trimmed(error, torch.tensor(17 / 400))
+    keep = trimmed_keep(error, torch.tensor(17 / 400))
     # a pixel alone is kept for its neighbours' sake, a block loses its middle and edges
     assert keep[5, 5] == 1 and not keep[15:17, 15:17].any() and keep[:13].all()
-    assert trimmed(error, torch.tensor(0.0)).all()
+    assert trimmed_keep(error, torch.tensor(0.0)).all()
 
 
 def test_masks_take_more_the_larger_the_loss_and_never_the_upper_part(scene, tmp_path):
@@ -304,7 +304,7 @@ def test_colours_start_at_degree_zero(scene, tmp_path):
     context = shot_of(trainer.data)
     leaf = {**effect._leaf(context), "rest_bias0": torch.ones(45)}
     g = trainer.gaussians
-    visible = Visible(torch.zeros(len(g), 3), g.means, g.attributes)
+    visible = VisibleGaussians(torch.zeros(len(g), 3), g.means, g.attributes)
     early, late = (effect.forward(visible, leaf, replace(context, nominal=n)) for n in (1000.0, 2000.0))
     # features are zero: every Gaussian has the photo's one colour, until directions count
     torch.testing.assert_close(early, early[:1].expand_as(early))
@@ -339,7 +339,7 @@ def test_it_starts_as_3dgs_but_for_little(swag):
     trainer, effect = swag
     context = shot_of(trainer.data)
     base = random(len(trainer.gaussians), 3)
-    colours = effect.forward(Visible(base, trainer.gaussians.means), effect._leaf(context), context)
+    colours = effect.forward(VisibleGaussians(base, trainer.gaussians.means), effect._leaf(context), context)
     assert float((colours - base).abs().max()) < 0.1
     assert effect.change(trainer.gaussians, effect._leaf(context), context) == {}  # gates have not begun
 
@@ -351,10 +351,10 @@ def test_means_over_what_is_seen_are_the_same_on_an_accelerator(swag, monkeypatc
     view = replace(view, fx=4 * view.fx, fy=4 * view.fy)  # sees a part
     seen, values = in_picture(g.means, view), random(len(g), 2)
     assert 0 < int(seen.sum()) < len(g)
-    on_cpu = mean_of_seen(values[seen], g.means[seen], view)
+    on_cpu = mean_of_visible(values[seen], g.means[seen], view)
     monkeypatch.setattr("ambiguous_wild.splat.backend.accelerated", lambda device: True)
-    torch.testing.assert_close(mean_of_seen(values, g.means, view), on_cpu)
-    torch.testing.assert_close(mean_of_seen(values[:, 0], g.means, view), values[seen, 0].mean())
+    torch.testing.assert_close(mean_of_visible(values, g.means, view), on_cpu)
+    torch.testing.assert_close(mean_of_visible(values[:, 0], g.means, view), values[seen, 0].mean())
 
 
 def test_gates_close_by_their_logit_and_only_in_photos(swag):

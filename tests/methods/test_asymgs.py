@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from ambiguous_wild.methods.asymgs import (
+    AlternatingMask,
     AsymGsConfig,
-    AsymMask,
-    SlowAverage,
-    SlowDensity,
-    slow,
-    slow_gaussians,
+    EmaDensity,
+    ParameterEma,
+    ema_attribute,
+    ema_gaussians,
 )
-from ambiguous_wild.vision.mask_ops import keep_unsuspicious, unsupported
+from ambiguous_wild.vision.mask_ops import drop_static_instances, keep_from_suspects
 from tests.methods.baselines import data_of, parts_of, step_of, trained, trainer_of
 from tests.splat.scenes import gaussians
 
@@ -23,14 +23,14 @@ from tests.splat.scenes import gaussians
 def seen(scene, tmp_path_factory):
     """The training side, and a mask policy that was shown it."""
     data = data_of(scene, tmp_path_factory.mktemp("cache"))
-    mask = AsymMask(AsymGsConfig())
+    mask = AlternatingMask(AsymGsConfig())
     mask.setup(data)
     return data, mask
 
 
 def averaged(g):
-    effect = SlowAverage(0.8)
-    return effect, g.carrying({name: row.values for name, row in effect.rows(g).items()})
+    effect = ParameterEma(0.8)
+    return effect, g.with_attributes({name: row.values for name, row in effect.rows(g).items()})
 
 
 def test_the_average_by_hand():
@@ -38,22 +38,22 @@ def test_the_average_by_hand():
     first = g.means.clone()
     g.means += 1.0
     effect.after_step(None, g)
-    assert torch.allclose(g.attributes[slow("means")], first + 0.2)
+    assert torch.allclose(g.attributes[ema_attribute("means")], first + 0.2)
     effect.after_step(None, g)
-    assert torch.allclose(g.attributes[slow("means")], first + 0.36)
-    teacher = slow_gaussians(g)
+    assert torch.allclose(g.attributes[ema_attribute("means")], first + 0.36)
+    teacher = ema_gaussians(g)
     assert torch.equal(teacher.means, g.attributes["slow_means"]) and torch.equal(teacher.sh_rest, g.sh_rest)
-    assert slow_gaussians(gaussians(n=4)) is None
+    assert ema_gaussians(gaussians(n=4)) is None
 
 
 def test_a_child_of_a_split_averages_from_where_it_lies():
     _, g = averaged(gaussians(n=4, rest=3))
-    g.attributes[slow("quats")][:] = 7.0
-    child = SlowDensity(AsymGsConfig().density, 1.0, 0)._split_half(g.select(torch.arange(4)))
+    g.attributes[ema_attribute("quats")][:] = 7.0
+    child = EmaDensity(AsymGsConfig().density, 1.0, 0)._split_half(g.select(torch.arange(4)))
     assert not torch.equal(child.means, g.means)
-    assert torch.equal(child.attributes[slow("means")], child.means)
-    assert torch.equal(child.attributes[slow("log_scales")], child.log_scales)
-    assert torch.equal(child.attributes[slow("quats")], torch.full((4, 4), 7.0))
+    assert torch.equal(child.attributes[ema_attribute("means")], child.means)
+    assert torch.equal(child.attributes[ema_attribute("log_scales")], child.log_scales)
+    assert torch.equal(child.attributes[ema_attribute("quats")], torch.full((4, 4), 7.0))
 
 
 def test_instances_more_suspect_than_the_photo_go_by_hand():
@@ -61,7 +61,7 @@ def test_instances_more_suspect_than_the_photo_go_by_hand():
     suspect = torch.zeros(3, 4, dtype=torch.bool)
     suspect[0, 0] = suspect[0, 2] = suspect[0, 3] = suspect[2, 2] = True
     suspect[1, 0] = True  # shares: photo 5/12, label 1 2/4, label 2 1/4, label 3 1/2
-    assert keep_unsuspicious(labels, suspect).tolist() == [[1, 1, 0, 0], [1, 1, 0, 0], [1, 1, 0, 0]]
+    assert keep_from_suspects(labels, suspect).tolist() == [[1, 1, 0, 0], [1, 1, 0, 0], [1, 1, 0, 0]]
 
 
 def test_instances_with_points_are_static():
@@ -75,14 +75,18 @@ def test_instances_with_points_are_static():
     )
     scene = SimpleNamespace(points=points, views=[SimpleNamespace(name="a"), SimpleNamespace(name="b")])
     # four points in label 1; the one in label 3 has two observations and is not counted
-    assert unsupported(labels, scene, "b", 0.1).tolist() == [[0, 0, 2, 2], [0, 0, 2, 2], [0, 0, 3, 3]]
-    assert unsupported(labels, scene, "b", 0.1, least_track=2).tolist() == [
+    assert drop_static_instances(labels, scene, "b", 0.1).tolist() == [
+        [0, 0, 2, 2],
+        [0, 0, 2, 2],
+        [0, 0, 3, 3],
+    ]
+    assert drop_static_instances(labels, scene, "b", 0.1, least_track=2).tolist() == [
         [0, 0, 2, 2],
         [0, 0, 2, 2],
         [0] * 4,
     ]
     # density of label 1 is three times that of the photo
-    assert unsupported(labels, scene, "b", 3.5)[0, 0] == 1
+    assert drop_static_instances(labels, scene, "b", 3.5)[0, 0] == 1
 
 
 def test_the_soft_mask_starts_open_and_closes_where_features_differ(seen):
@@ -144,7 +148,7 @@ def test_growth_carries_the_average(scene, tmp_path):
     g = trainer.gaussians
     assert sum(r.split for r in trainer.density.log.rounds) > 0
     assert all(len(tensor) == len(g) for tensor in g.attributes.values())
-    gap = (g.attributes[slow("means")] - g.means).norm(dim=1)
+    gap = (g.attributes[ema_attribute("means")] - g.means).norm(dim=1)
     assert 0 < float(gap.median()) < 0.01 * trainer.data.scene.extent
 
 
@@ -159,4 +163,4 @@ def test_the_average_is_not_that_of_postponed_harmonics(scene, tmp_path):
             break
         trainer.optimiser.flush()
         want.lerp_(trainer.gaussians.sh_rest, 0.2)
-        assert torch.equal(trainer.gaussians.attributes[slow("sh_rest")], want)
+        assert torch.equal(trainer.gaussians.attributes[ema_attribute("sh_rest")], want)

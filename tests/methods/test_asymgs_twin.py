@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from ambiguous_wild.methods.asymgs import TWIN, HardMask, SecondModel, TwinConfig
+from ambiguous_wild.methods.asymgs import TWIN, HardMask, TwinConfig, TwinField
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.fields import STATIC
 from ambiguous_wild.splat.losses import photometric
@@ -18,7 +18,7 @@ def twin(scene, tmp_path):
     data = data_of(scene, tmp_path / "cache")
     masks = HardMask(TwinConfig())
     masks.setup(data)
-    fields = SecondModel(TwinConfig(), masks)
+    fields = TwinField(TwinConfig(), masks)
     fields.data = data
     return fields
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from ambiguous_wild.methods.desplat import DeSplatConfig, Layers
+from ambiguous_wild.methods.desplat import DeSplatConfig, ViewLayers
 from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.rendered import Cotangents, Frame
 from ambiguous_wild.splat.step import ViewContext
@@ -16,7 +16,7 @@ from tests.methods.baselines import data_of, masked_more_inside, parts_of, train
 @pytest.fixture(scope="module")
 def starts(scene, tmp_path_factory):
     data = data_of(scene, tmp_path_factory.mktemp("cache"))
-    return data, Layers(DeSplatConfig(points=300, speed=2.0)).setup(
+    return data, ViewLayers(DeSplatConfig(points=300, speed=2.0)).setup(
         data, None, lambda progress: {"means": 0.5 - progress}
     )
 
@@ -52,7 +52,7 @@ def test_learning_rates_are_the_released_ones_times_the_speed(starts):
 
 
 def test_the_composite_by_hand():
-    layers = Layers(DeSplatConfig())
+    layers = ViewLayers(DeSplatConfig())
     frames = {STATIC: frame(0.8, 0.9), str(0): frame(0.3, 0.4)}
     made, vjp = layers.compose(frames, context())
     assert made.image[0, 0].tolist() == pytest.approx([0.3 + 0.6 * 0.8] * 3)
@@ -64,7 +64,7 @@ def test_the_composite_by_hand():
 
 
 def test_layers_are_not_drawn_before_their_start():
-    layers = Layers(DeSplatConfig(min_start=300))
+    layers = ViewLayers(DeSplatConfig(min_start=300))
     assert layers.drawn(context(4)) == ("4",) and layers.drawn(context(4, 299)) == ()
     assert layers.drawn(context(None)) == ()
     static, given = frame(0.8, 0.9), Cotangents(image=torch.ones(2, 3, 3))
@@ -74,7 +74,7 @@ def test_layers_are_not_drawn_before_their_start():
 
 
 def test_the_alpha_terms_pull_static_up_and_the_layer_down():
-    layers = Layers(DeSplatConfig(alpha_static=0.6, alpha_own=0.3))
+    layers = ViewLayers(DeSplatConfig(alpha_static=0.6, alpha_own=0.3))
     terms = layers.regularise({STATIC: frame(0.8, 0.9), str(2): frame(0.3, 0.4)}, context(2))
     assert terms[STATIC].alpha.tolist() == [[pytest.approx(-0.1)] * 3] * 2  # 0.6 over 6 pixels
     assert terms[str(2)].alpha.tolist() == [[pytest.approx(0.05)] * 3] * 2
@@ -85,7 +85,7 @@ def test_only_the_layer_of_the_view_learns(scene, tmp_path):
     others = trainer.drawing.others
     before = {name: field.gaussians.sh0.clone() for name, field in others.items()}
     trainer.step()
-    seen = str(trainer.pace.view(1))
+    seen = str(trainer.run_schedule.view(1))
     assert {name for name, field in others.items() if not torch.equal(field.gaussians.sh0, before[name])} == {
         seen
     }

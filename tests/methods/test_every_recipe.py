@@ -6,7 +6,7 @@ import torch
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods.builtin import BUILTIN
-from ambiguous_wild.methods.uad import UncertaintyAware
+from ambiguous_wild.methods.uad import UncertaintyAwareDensity
 from ambiguous_wild.splat.effects import effect_pipeline
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.trainer import Trainer
@@ -154,13 +154,13 @@ def flat(state, name=""):
 def test_density_control_gets_the_masks_of_a_composite(scene, tmp_path, monkeypatch, host):
     """Such a method weighs no loss by `keep`; UAD reads what its composite weighs."""
     given = []
-    own = UncertaintyAware.observe
+    own = UncertaintyAwareDensity.observe
 
     def observe(self, step, gradients, keep=None):
         given.append(None if keep is None else float(keep.mean()))
         own(self, step, gradients, keep)
 
-    monkeypatch.setattr(UncertaintyAware, "observe", observe)
+    monkeypatch.setattr(UncertaintyAwareDensity, "observe", observe)
     small = {"forestsplats": {"points": "40", "width": "8", "side": "32"}, "hybridgs": {"points": "60"}}
     options = {**small.get(host, {}), **({"apart": "1", "joint": "2"} if host == "hybridgs" else {})}
     options |= {"min_start": "0"} if host == "desplat" else {}

@@ -13,8 +13,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.methods import MethodEntry, get_method, register
-from ambiguous_wild.methods.given_masks import GraftedPolicy
-from ambiguous_wild.methods.graft import check_graft, compose, graft_name
+from ambiguous_wild.methods.given_masks import GraftedMaskPolicy
+from ambiguous_wild.methods.graft import check_graft, combine_policies, graft_name
 from ambiguous_wild.methods.refinesplat.density_control import EntropyAwareDensity
 from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.methods.robustsplat import RobustSplatConfig, RobustSplatMask
@@ -69,7 +69,7 @@ def test_names_that_mean_nothing_are_refused(name, message):
 
 def test_places_come_from_their_donors_and_the_rest_from_the_host():
     parts = parts_of("robustsplat@mask=refinesplat,density=refinesplat")
-    assert isinstance(parts.mask, GraftedPolicy)
+    assert isinstance(parts.mask, GraftedMaskPolicy)
     assert isinstance(parts.mask.mask, RefineSplatMask)
     assert parts.mask.regulariser is None  # the host has none, and the donor's was not asked for
     assert parts.density is EntropyAwareDensity
@@ -203,7 +203,9 @@ def test_a_methods_own_mask_changes_no_bit(scene, tmp_path):
     assert bits(trained(scene, tmp_path / "density", parts_of(name, **both), 60)) == bits(own)
     # and where it is a second instance of its own, which knows nothing of the host's
     parts = parts_of("robustsplat", **options)
-    second = MethodHooks(**{**vars(parts), "mask": GraftedPolicy(RobustSplatMask(parts.mask.config), None)})
+    second = MethodHooks(
+        **{**vars(parts), "mask": GraftedMaskPolicy(RobustSplatMask(parts.mask.config), None)}
+    )
     assert bits(trained(scene, tmp_path / "second", second, 60)) == bits(own)
 
 
@@ -340,11 +342,13 @@ def test_the_regulariser_sees_the_hosts_keep_map():
             seen.append(keep)
             return "cotangent"
 
-    policy = compose(Masks(), Regulariser())
+    policy = combine_policies(Masks(), Regulariser())
     assert policy.cotangent(None, policy.keep(None)) == "cotangent"
     assert seen == ["kept"]
     assert policy.predict(None) == "kept"
-    assert compose(Regulariser(), Masks()).cotangent(None, None) is None  # Masks has no loss of its own
+    assert (
+        combine_policies(Regulariser(), Masks()).cotangent(None, None) is None
+    )  # Masks has no loss of its own
 
 
 def test_grafts_are_ordinary_runs_from_the_command_line(scene, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.methods.mcmc import McmcConfig, McmcDensity, divided
+from ambiguous_wild.methods.mcmc import McmcConfig, McmcDensity, relocation
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.rendered import Gradients
@@ -21,7 +21,7 @@ ROUND = McmcConfig(start=1.0, every=1.0, min_every=1, noise=0.0, apart=0.0)  # a
 
 def some(n=40):
     """Gaussians that carry their number, of which the first five are dead."""
-    g = gaussians(n=n, rest=3).carrying({"tag": torch.arange(float(n))})
+    g = gaussians(n=n, rest=3).with_attributes({"tag": torch.arange(float(n))})
     g.opacity_logits[:5] = -9.0
     return g
 
@@ -39,7 +39,7 @@ def one_round(g, config=ROUND, ceiling=1000, iteration=1):
 
 
 def test_copies_by_hand():
-    opacity, factor = divided(torch.tensor([0.5, 0.5, 0.3]), torch.tensor([1, 2, 3]))
+    opacity, factor = relocation(torch.tensor([0.5, 0.5, 0.3]), torch.tensor([1, 2, 3]))
     # m = 2: o' = 1 - sqrt(1/2), D = 2 o' - o'^2 / sqrt(2)
     assert opacity[:2].tolist() == pytest.approx([0.5, 0.292893], abs=1e-6)
     assert factor[:2].tolist() == pytest.approx([1.0, 0.5 / 0.525126], abs=1e-5)
@@ -54,7 +54,7 @@ def test_copies_by_hand():
 
 
 def test_many_copies_stay_in_range():
-    opacity, factor = divided(torch.tensor([0.999, 0.01, 1.0 - 1e-7]), torch.tensor([51, 400, 51]))
+    opacity, factor = relocation(torch.tensor([0.999, 0.01, 1.0 - 1e-7]), torch.tensor([51, 400, 51]))
     assert bool((opacity >= 0.005).all()) and bool((opacity < 1).all())
     assert bool(torch.isfinite(factor).all()) and bool((factor > 0).all())
 
@@ -79,7 +79,7 @@ def test_the_dead_move_and_the_number_grows_by_a_share():
 
 @pytest.mark.parametrize("dead", [0, 1500])
 def test_copies_start_at_draws_of_their_source(dead):
-    g = gaussians(n=1, rest=3).carrying({"tag": torch.zeros(1)})
+    g = gaussians(n=1, rest=3).with_attributes({"tag": torch.zeros(1)})
     for tensor, value in ((g.means, 0.0), (g.quats, 0.0), (g.opacity_logits, 3.0)):
         tensor.fill_(value)
     g.quats[:, 0] = g.quats[:, 3] = 0.5**0.5  # a quarter turn around z: x becomes y

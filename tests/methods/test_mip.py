@@ -13,10 +13,10 @@ from ambiguous_wild.methods.mip import (
     MipConfig,
     MipDensity,
     build,
-    matched,
     opacity_factor,
+    upper_quantile,
 )
-from ambiguous_wild.methods.uad import UncertaintyAware, footprint_mean
+from ambiguous_wild.methods.uad import UncertaintyAwareDensity, footprint_mean
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.effects.smoothing import SmoothingFilter, filter_sizes
@@ -68,7 +68,7 @@ def test_without_the_filter_the_density_control_is_refused(scene, tmp_path):
 
 def test_matched_growth_takes_as_many_by_the_absolute_gradient():
     absolute = torch.arange(100.0)
-    assert matched(absolute, 0.1) == pytest.approx(np.quantile(np.arange(100.0), 0.9))
+    assert upper_quantile(absolute, 0.1) == pytest.approx(np.quantile(np.arange(100.0), 0.9))
     g = gaussians(n=100, rest=3)
     density = AbsoluteMipDensity(DensityConfig(grow_grad=1.0), extent=1.0, seed=0)
     density._match(g)
@@ -105,7 +105,7 @@ def test_masked_views_and_small_ones_count_less():
     g = gaussians(n=2, rest=3)
     g.means.copy_(torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 3.0]]))
     view = camera()
-    density = UncertaintyAware(DensityConfig(), extent=1.0, seed=0)
+    density = UncertaintyAwareDensity(DensityConfig(), extent=1.0, seed=0)
 
     def see(gradient, count, keep):
         rendered = SimpleNamespace(visible=torch.ones(2, dtype=torch.bool), radii=torch.ones(2))
@@ -124,7 +124,7 @@ def test_uad_is_a_density_control_for_any_host_and_for_the_cpu_alone(scene, tmp_
     often = {"density.every": "2000", "density.min_every": "10"}
     plain = trained(scene, tmp_path / "plain", parts_of("dronesplat", **often), iterations=120)
     host = parts_of("dronesplat@density=uad", **often)
-    assert host.density is UncertaintyAware
+    assert host.density is UncertaintyAwareDensity
     assert bits(trained(scene, tmp_path / "uad", host, iterations=120)) != bits(plain)
     with pytest.raises(AwError, match=r"'count'.*gsplat.*--device cpu"):
         check_needs(host.density.needs, GSPLAT_SUMS)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ambiguous_wild.methods import dronesplat, masking_common, robustsplat
-from ambiguous_wild.methods.masking_common import MaskNet, adam_of, adam_state, enlarged, load_adam_state
+from ambiguous_wild.methods.masking_common import MaskNet, adam_of, adam_state, load_adam_state, upsampled
 from ambiguous_wild.methods.robustsplat import RobustSplatConfig
 from ambiguous_wild.splat import checkpoint
 from ambiguous_wild.splat.step import Step
@@ -75,7 +75,7 @@ def test_the_histogram_and_its_percentiles_are_the_cpus_bits(monkeypatch):
         for e in residuals:
             histogram = masking_common.update_histogram(histogram, e, 0.95)
             found += [masking_common.percentile(histogram, share) for share in (0.01, 0.6, 0.8, 1.0)]
-        return histogram, found, masking_common.bound(residuals[0], found[-2])
+        return histogram, found, masking_common.inlier_map(residuals[0], found[-2])
 
     histogram, numbers, bound = run()
     on_accelerator(monkeypatch)
@@ -154,7 +154,7 @@ def test_enlarging_copies_its_weights_once():
     for dtype, tolerance in ((torch.float32, 1e-6), (torch.float64, 1e-6)):
         chw = grid.to(dtype).permute(2, 0, 1)[None]
         want = torch.nn.functional.interpolate(chw, size=(17, 13), mode="bilinear")[0].permute(1, 2, 0)
-        torch.testing.assert_close(enlarged(grid.to(dtype), 17, 13), want, rtol=0, atol=tolerance)
+        torch.testing.assert_close(upsampled(grid.to(dtype), 17, 13), want, rtol=0, atol=tolerance)
 
 
 # -- state ----------------------------------------------------------------------------------------

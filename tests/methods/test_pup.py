@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.methods.pup import PupConfig, PupDensity, log_det, removed
+from ambiguous_wild.methods.pup import PupConfig, PupDensity, log_det, prune_mask
 from ambiguous_wild.splat.render import render
 from ambiguous_wild.splat.training_loop import train
 from tests.methods.baselines import parts_of, trained, trainer_of
@@ -27,10 +27,10 @@ def test_the_score_by_hand():
 def test_who_is_removed_by_hand():
     score = torch.tensor([5.0, 1.0, 4.0, 2.0, 3.0])
     # index int(0.8 * 4) = 3 of the sorted scores is 4
-    assert removed(score, 0.8).tolist() == [False, True, True, True, True]
-    assert removed(score, 0.5).tolist() == [False, True, False, True, True]
+    assert prune_mask(score, 0.8).tolist() == [False, True, True, True, True]
+    assert prune_mask(score, 0.5).tolist() == [False, True, False, True, True]
     ties = torch.tensor([-9.0, -9.0, -9.0, 2.0, 3.0])
-    assert removed(ties, 0.2).tolist() == [True, True, True, False, False]
+    assert prune_mask(ties, 0.2).tolist() == [True, True, True, False, False]
 
 
 def test_the_block_approaches_the_sum_over_pixels_and_channels():

@@ -8,7 +8,7 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.job import read_sources
 from ambiguous_wild.methods import registry
-from ambiguous_wild.methods.graft import graft_name, with_files
+from ambiguous_wild.methods.graft import graft_name, replace_reference_files
 from ambiguous_wild.methods.references import import_file, reference_file
 
 CODE = r'''
@@ -199,7 +199,7 @@ def test_a_description_of_the_package_is_named_alike_from_every_folder(tmp_path,
     monkeypatch.chdir(tmp_path)
     entry = registry.get_method(name)
     assert entry.name == "opensplat" and entry.given_as == name and reference_file(name) is None
-    assert with_files(f"{name}+2passes", lambda path: tmp_path / path) == f"{name}+2passes"
+    assert replace_reference_files(f"{name}+2passes", lambda path: tmp_path / path) == f"{name}+2passes"
     ((text, path),) = [(source.text, source.path) for source in read_sources([], [name])]
     assert (text, path) == (name, "")
     (tmp_path / "mine").write_text("name: mine\ntrain: x\nrenders: '{stem}'\n")

@@ -52,7 +52,7 @@ def test_boxes_are_opencvs(shape, size, both):
     x = noise(0, *shape)
     expected = cv2.blur(x, (size, size), borderType=cv2.BORDER_REPLICATE)
     # sums of `size` float32 in [0, 1], twice: at most 2 * size roundings of 2^-24
-    assert np.allclose(structure.box(tensor(x)[None], size)[0], expected, atol=2 * size * 2**-24)
+    assert np.allclose(structure.box_filter(tensor(x)[None], size)[0], expected, atol=2 * size * 2**-24)
 
 
 @pytest.mark.parametrize("shape", [(40, 50), (41, 51), (7, 3)])  # halves are whole, or not
@@ -311,7 +311,7 @@ def test_looks_at_all_rows_count_what_looks_at_some_do(monkeypatch, masked):
         for seed in range(4):
             gaussians = scenes.gaussians(seed, 300)
             gaussians.means[0] = torch.nan  # until the next round of density control
-            support.look(gaussians, tensor(noise(seed, 300) < 0.8), cam, keep)
+            support.observe(gaussians, tensor(noise(seed, 300) < 0.8), cam, keep)
         counts.append(support)
     host, device = counts
     assert torch.equal(host.looked, device.looked) and torch.equal(host.kept, device.kept)
@@ -366,7 +366,7 @@ def test_couples_are_those_that_one_after_the_other_gives(seed):
     pairs = pairs[pairs[:, 0] < pairs[:, 1]]
     rng.shuffle(pairs)
     cluster = merging.clusters(60, tensor(pairs), 2)
-    taken = merging.matching(60, tensor(pairs)).numpy()
+    taken = merging.greedy_matching(60, tensor(pairs)).numpy()
     assert taken.sum() > 10
     assert taken.tolist() == [bool(cluster[i] == cluster[j]) for i, j in pairs.tolist()]
 
@@ -386,7 +386,7 @@ def test_a_round_on_an_accelerator_merges_what_the_cpu_merges(monkeypatch, most)
         on(monkeypatch, False)
         optimiser = SplatAdam(g, rates)
         on(monkeypatch, there)
-        found = merging.merged(g, density.views_seen > 0, density.config.merge)
+        found = merging.merge_gaussians(g, density.views_seen > 0, density.config.merge)
         on(monkeypatch, False)
         results.append((density.after_growth(step, g, optimiser), density, found[1]))
     (host, one, a), (device, two, b) = results

@@ -12,13 +12,13 @@ from ambiguous_wild.methods.refinesplat import masks, pixels
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
 from ambiguous_wild.methods.refinesplat.threshold import (
     TEMPERATURE,
-    contrast,
+    cross_entropy,
     entropy,
-    learnt,
+    instance_stats,
+    kl_divergence,
     objective,
-    pool_of,
-    surprise,
     t_ent,
+    updated_theta,
 )
 from tests.methods.on_device import tensor
 
@@ -53,9 +53,11 @@ def test_entropy_equals_the_printed_sum_and_its_largest_value_is_one():
 @pytest.mark.parametrize("variant", ["sigmoid", "softmax"])
 def test_surprise_is_the_photos_entropy_where_nothing_changed(variant):
     a, b = torch.randn(2, 30, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    assert float(contrast(a, a, variant).abs().max()) < 1e-12
-    assert bool((contrast(a, b, variant) > 0).all())
-    assert torch.allclose(surprise(a, b, variant), surprise(b, b, variant) + contrast(a, b, variant))
+    assert float(kl_divergence(a, a, variant).abs().max()) < 1e-12
+    assert bool((kl_divergence(a, b, variant) > 0).all())
+    assert torch.allclose(
+        cross_entropy(a, b, variant), cross_entropy(b, b, variant) + kl_divergence(a, b, variant)
+    )
 
 
 def test_unknown_variant_is_named():
@@ -69,7 +71,7 @@ def test_unknown_variant_is_named():
 def cut_of(values, *settings, **more) -> tuple[float, np.ndarray]:
     """T_ent and the instances above it; the pool has gaps, as the stack of all photos has them."""
     padded = np.r_[np.nan, values, np.nan, np.nan]
-    threshold = float(t_ent(pool_of(tensor(padded)), *settings, **more).threshold)
+    threshold = float(t_ent(instance_stats(tensor(padded)), *settings, **more).threshold)
     return threshold, np.asarray(values) > threshold
 
 
@@ -110,7 +112,7 @@ def test_the_printed_objective_degenerates():
     values = np.r_[np.full(20, 0.05), 0.25, 0.3] + np.arange(22) * 1e-4
     assert cut_of(values, 0.4, "literal")[1].sum() == 21  # w2 < 1/2: all but the smallest value
     assert cut_of(values, 0.6, "literal")[1].sum() == 0  # w2 > 1/2: nothing
-    scores, _ = objective(pool_of(tensor(values)), 0.5, "literal")
+    scores, _ = objective(instance_stats(tensor(values)), 0.5, "literal")
     assert np.ptp(scores.numpy()) < 1e-12  # w2 = 1/2: any threshold is as good as any other
     assert cut_of(values, 0.5, "kapur", gate=3.0)[1].sum() == 2
 
@@ -131,13 +133,13 @@ def test_thresholds_it_is_compared_with():
     assert cut_of([15.0], form="hard", hard=12.0)[1].tolist() == [True]
     assert cut_of(values, form="statistics")[0] == pytest.approx(values.mean() + values.std())
     assert not cut_of(values, form="statistics", least=25.0)[1].any()
-    cut = t_ent(pool_of(tensor(values)), gate=3.0)
+    cut = t_ent(instance_stats(tensor(values)), gate=3.0)
     spread = 1.4826 * np.median(np.abs(values - 2.5))
     assert float(cut.floor) == pytest.approx(2.5 + 3 * spread)
-    low = cut.below(torch.tensor(1.7, dtype=torch.float64))
+    low = cut.capped(torch.tensor(1.7, dtype=torch.float64))
     assert float(low.threshold) == float(low.floor) == pytest.approx(1.7)
     with pytest.raises(AwError, match="kapur"):
-        t_ent(pool_of(tensor(values)), form="kapurr")  # type: ignore[arg-type]
+        t_ent(instance_stats(tensor(values)), form="kapurr")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("high", [1, 3, 20])
@@ -164,7 +166,9 @@ def coverage(visits, cost: float, floor: float, form: str = "kapur") -> torch.Te
     theta = torch.zeros((), dtype=torch.float64)
     for values in visits:
         one = torch.ones(len(values), dtype=torch.float64)
-        theta = learnt(theta, pool_of(tensor(values)), cost * one, one, torch.tensor(floor), form)
+        theta = updated_theta(
+            theta, instance_stats(tensor(values)), cost * one, one, torch.tensor(floor), form
+        )
     return theta
 
 
@@ -209,9 +213,11 @@ def test_the_weights_step_is_the_gradient_of_the_loss(form):
     (slope,) = torch.autograd.grad((share * ((1 - member) * tensor(costs) + member)).sum(), theta)
     order = rng.permutation(9)
     padded = [tensor(np.r_[np.nan, a[order], np.nan]) for a in (values, costs, areas)]
-    found = learnt(theta.detach(), pool_of(padded[0]), *padded[1:], torch.tensor(-math.inf), form)
+    found = updated_theta(
+        theta.detach(), instance_stats(padded[0]), *padded[1:], torch.tensor(-math.inf), form
+    )
     assert float(found - theta.detach()) == pytest.approx(-float(slope), rel=1e-9)
-    alone = learnt(theta.detach(), pool_of(padded[0]), *padded[1:], torch.tensor(0.29), form)
+    alone = updated_theta(theta.detach(), instance_stats(padded[0]), *padded[1:], torch.tensor(0.29), form)
     assert float(alone) == float(theta.detach())  # one candidate: w2 has no influence
 
 
@@ -290,7 +296,7 @@ def test_a_fixed_global_threshold_and_the_adaptive_one_by_hand():
 
 
 def grown(mask: np.ndarray, config: MaskConfig, evidence: np.ndarray) -> np.ndarray:
-    return pixels.grown(tensor(mask), config, tensor(evidence)).numpy()
+    return pixels.final_mask(tensor(mask), config, tensor(evidence)).numpy()
 
 
 def test_the_mask_is_bounded_and_the_surest_pixels_go():

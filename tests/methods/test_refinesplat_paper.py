@@ -13,7 +13,7 @@ from ambiguous_wild.core.config import flatten, from_plain, to_plain, with_optio
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
-from ambiguous_wild.methods.refinesplat.inputs import untracked
+from ambiguous_wild.methods.refinesplat.inputs import untracked_instances
 from ambiguous_wild.methods.refinesplat.paper import PaperConfig, PrintedConfig
 from ambiguous_wild.methods.refinesplat.recipe import (
     RefineSplatMask,
@@ -261,7 +261,7 @@ def test_what_a_tracker_leaves_out_has_labels_above_its_own():
     tracked[:, :4] = 1
     found = np.zeros((4, 8), np.int32)
     found[:, :3], found[:, 3:5], found[:2, 6:], found[2:, 6:] = 4, 1, 2, 3
-    added = untracked(tracked, found)
+    added = untracked_instances(tracked, found)
     # 4 is known, half of 1 is covered (known), 2 and 3 are new
     assert not added[:, :6].any()
     assert sorted(np.unique(added[:, 6:])) == [2, 3]

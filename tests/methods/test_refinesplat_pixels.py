@@ -7,19 +7,28 @@ import pytest
 import torch
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.evidence import Maps
+from ambiguous_wild.methods.refinesplat.evidence import ComparisonMaps
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
-from ambiguous_wild.methods.refinesplat.maps import Ranks, agree, agreement_weight, common_offset
-from ambiguous_wild.methods.refinesplat.masks import Labels, PhotoMasks, make_masks
+from ambiguous_wild.methods.refinesplat.maps import (
+    ViewQuantile,
+    agreement_weight,
+    colours_agree,
+    common_offset,
+)
+from ambiguous_wild.methods.refinesplat.masks import InstanceLabels, PhotoMasks, make_masks
 from ambiguous_wild.methods.refinesplat.multiview import (
     MultiViewConfig,
     MultiViewEvidence,
-    OtherViews,
+    MultiViewStore,
     discount,
     nearest_views,
 )
 from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence
-from ambiguous_wild.methods.refinesplat.structure import correlation, structure_residual, unrelated_residual
+from ambiguous_wild.methods.refinesplat.structure import (
+    correlation,
+    structure_residual,
+    unrelated_pair_residual,
+)
 from tests.methods.on_device import noise, number, tensor
 
 H, W, FOCAL, PLANE = 40, 64, 60.0, 5.0
@@ -35,18 +44,18 @@ def plain(count: int) -> list[np.ndarray]:
     return [np.full((H, W, 3), 0.5, np.float32)] * count
 
 
-def others_of(cameras, photos, config=None, surfaces=()) -> OtherViews:
-    return OtherViews(cameras, photos, config or MultiViewConfig(), surfaces, "cpu")
+def others_of(cameras, photos, config=None, surfaces=()) -> MultiViewStore:
+    return MultiViewStore(cameras, photos, config or MultiViewConfig(), surfaces, "cpu")
 
 
-def store(others: OtherViews, view: int, evidence: np.ndarray, depth: np.ndarray) -> None:
+def store(others: MultiViewStore, view: int, evidence: np.ndarray, depth: np.ndarray) -> None:
     evidence, depth = (tensor(np.asarray(x, np.float32)) for x in (evidence, depth))
-    others.remember(view, evidence, others.halved(view, depth))
+    others.store(view, evidence, others.halved(view, depth))
 
 
-def asked(others: OtherViews, view: int) -> MultiViewEvidence:
+def asked(others: MultiViewStore, view: int) -> MultiViewEvidence:
     """What the others say about the surface that the view stored, as arrays."""
-    found = others.ask(view, others.depth.of(view)[0])
+    found = others.query(view, others.depth.of(view)[0])
     return MultiViewEvidence(*(x.numpy() for x in (found.evidence, found.weight, found.coverage)))
 
 
@@ -64,11 +73,13 @@ def pixel_evidence(photos, cameras, surfaces=(), **changes) -> PixelEvidence:
 def masks_of(values, labels, config, ceiling=None, unseen=None, moving=None) -> PhotoMasks:
     """Of one photo whose evidence is `values`, judged alone."""
     count = int(labels.max())
-    known = Labels([labels], [np.zeros(count, bool)], [None if unseen is None else ~unseen], "cpu")
+    known = InstanceLabels([labels], [np.zeros(count, bool)], [None if unseen is None else ~unseen], "cpu")
     values, none = tensor(values), torch.full((1, known.most), torch.nan, dtype=torch.float64)
     ceiling = None if ceiling is None else number(ceiling)
     seen = None if unseen is None else tensor(~unseen)
-    return make_masks(0, Maps(values, values), known, (none, none), 0.5, config, ceiling, seen, moving)
+    return make_masks(
+        0, ComparisonMaps(values, values), known, (none, none), 0.5, config, ceiling, seen, moving
+    )
 
 
 def test_correlation_is_pearsons_over_each_box():
@@ -119,7 +130,7 @@ def test_a_surface_at_another_depth_or_outside_says_nothing():
     other_views = others_of(cameras, plain(2))
     store(other_views, 0, np.ones((H, W)), np.full((H, W), PLANE))
     assert np.isnan(asked(other_views, 0).evidence).all()  # nobody else stored anything
-    assert others_of(cameras[:1], plain(1)).ask(0, torch.ones(H // 2, W // 2)) is None
+    assert others_of(cameras[:1], plain(1)).query(0, torch.ones(H // 2, W // 2)) is None
     store(other_views, 1, np.ones((H, W)), np.full((H, W), 2 * PLANE))
     assert np.isnan(asked(other_views, 0).evidence).all()
     store(other_views, 1, np.ones((H, W)), np.full((H, W), 1.05 * PLANE))
@@ -139,7 +150,7 @@ def test_quantiles_are_numpys_without_what_is_missing():
     for quantile in (0.0, 0.25, 0.5, 0.8, 1.0):
         with pytest.warns(RuntimeWarning):
             expected = np.nanquantile(stack, quantile, axis=0)
-        found = Ranks(7, quantile, "cpu").quantile_of(tensor(stack), there)
+        found = ViewQuantile(7, quantile, "cpu").quantile_of(tensor(stack), there)
         assert np.allclose(found, expected, equal_nan=True, atol=1e-6)
 
 
@@ -195,7 +206,9 @@ def test_exposure_and_white_balance_are_no_other_content():
     def alike(theirs, seen=True):
         difference = tensor(ours.astype(np.float32) - theirs).view(1, -1, 3).mT
         same = torch.full_like(difference[:, 0], seen, dtype=torch.bool)
-        return agree(difference, same, 0.06, common_offset(difference, same, 0.06)).view(20, 24).numpy()
+        return (
+            colours_agree(difference, same, 0.06, common_offset(difference, same, 0.06)).view(20, 24).numpy()
+        )
 
     found = alike(brighter)
     assert found[8:, 8:].all()
@@ -211,11 +224,11 @@ def test_exposure_and_white_balance_are_no_other_content():
 
 def test_unrelated_content_gives_far_more_than_a_blurred_render():
     photos = [tensor(noise(i, H, W, 3)) for i in range(4)]
-    whole = unrelated_residual(photos)
+    whole = unrelated_pair_residual(photos)
     smooth = [p.mean() + 0.5 * (p - p.mean()) for p in photos]
     assert whole > 3 * np.median([structure_residual(p, q) for p, q in zip(photos, smooth)])
-    assert unrelated_residual([*photos, tensor(noise(9, H // 2, W, 3))]) == pytest.approx(whole, rel=0.2)
-    assert unrelated_residual([]) == 0.0
+    assert unrelated_pair_residual([*photos, tensor(noise(9, H // 2, W, 3))]) == pytest.approx(whole, rel=0.2)
+    assert unrelated_pair_residual([]) == 0.0
 
 
 def test_no_threshold_is_above_the_ceiling():
@@ -247,7 +260,7 @@ def looked(
     pixels: PixelEvidence, view: int, image: np.ndarray, alpha: float = 1.0, depth: float = PLANE, **kwargs
 ) -> np.ndarray:
     a = torch.full((H, W), alpha)
-    return pixels.look(view, tensor(image), a, depth * a, **kwargs)[0].numpy()
+    return pixels.compute(view, tensor(image), a, depth * a, **kwargs)[0].numpy()
 
 
 def test_hard_surfaces_are_forgiven_and_what_one_view_shows_is_not():
@@ -259,8 +272,8 @@ def test_hard_surfaces_are_forgiven_and_what_one_view_shows_is_not():
     photos[0][24:36, 40:60] = 0.8  # one photo shows it
     pixels = pixel_evidence(photos, cameras)
     for view in range(4):
-        looked(pixels, view, renders[view], remember=True)
-    found = looked(pixels, 0, renders[0], remember=False)
+        looked(pixels, view, renders[view], store=True)
+    found = looked(pixels, 0, renders[0], store=False)
     assert found[28:32, 46:54].min() > 3 * found[4:8, 6:20].max()
     assert np.median(found) < 3
 
@@ -271,10 +284,10 @@ def test_a_surface_that_too_few_others_see_is_no_evidence():
     for least, wrong in ((2, 0.0), (0, 1.0)):
         pixels = pixel_evidence(photos, cameras, multiview=MultiViewConfig(seen_by=least))
         for view in range(4):
-            looked(pixels, view, photos[view], remember=True)
+            looked(pixels, view, photos[view], store=True)
         off = np.full((H, W, 3), 0.9, np.float32)
-        right = looked(pixels, 0, off, remember=False)[H // 2, W // 2]
-        far = looked(pixels, 0, off, depth=3 * PLANE, remember=False)[H // 2, W // 2]
+        right = looked(pixels, 0, off, store=False)[H // 2, W // 2]
+        far = looked(pixels, 0, off, depth=3 * PLANE, store=False)[H // 2, W // 2]
         assert right > 0.5 and far == pytest.approx(wrong * right)
 
 
@@ -290,11 +303,11 @@ def test_what_moves_for_certain_is_masked_where_the_render_agrees():
 def test_a_look_that_is_not_remembered_leaves_no_trace():
     photos = [noise(i, H, W, 3) for i in range(2)]
     pixels = pixel_evidence(photos, [camera(0.1 * i) for i in range(2)], memory=0.5)
-    assert np.isfinite(looked(pixels, 0, noise(7, H, W, 3), remember=False)).all()
+    assert np.isfinite(looked(pixels, 0, noise(7, H, W, 3), store=False)).all()
     assert pixels.normal.isnan().all()
-    looked(pixels, 0, noise(7, H, W, 3), remember=True)
+    looked(pixels, 0, noise(7, H, W, 3), store=True)
     before = {k: dict(rows) for k, rows in pixels.state_dict().items()}
-    looked(pixels, 0, noise(8, H, W, 3), remember=False)
+    looked(pixels, 0, noise(8, H, W, 3), store=False)
     after = pixels.state_dict()
     assert before["normal"] == after["normal"]
     for name in ("before", "evidence", "depth"):
@@ -304,10 +317,10 @@ def test_a_look_that_is_not_remembered_leaves_no_trace():
 def test_memory_averages_visits_and_thin_renders_are_no_evidence():
     photos, render = [np.full((H, W, 3), 0.5, np.float32)], np.full((H, W, 3), 0.9, np.float32)
     pixels = pixel_evidence(photos, [camera(0.0)], base=0.0, memory=0.5)
-    looked(pixels, 0, render, remember=True)
+    looked(pixels, 0, render, store=True)
     # plain patches of any colour correlate: base alone counts
     assert float(pixels.normal[0]) == pytest.approx(0.0, abs=1e-6)
     pixels.config = dataclasses.replace(pixels.config, base=1.0)
-    looked(pixels, 0, render, remember=True)
+    looked(pixels, 0, render, store=True)
     assert float(pixels.normal[0]) == pytest.approx(0.2, rel=1e-2)  # half of 0.4, half of the earlier 0
-    assert looked(pixels, 0, render, alpha=0.2, remember=False).max() <= 1.0
+    assert looked(pixels, 0, render, alpha=0.2, store=False).max() <= 1.0

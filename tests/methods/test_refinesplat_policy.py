@@ -201,10 +201,10 @@ def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene)
         policy = RefineSplatMask(dataclasses.replace(config, **changes))
         policy.setup(data)
         step = step_of(data, 1, blurred(scene.clean[1], 3))
-        return policy, *policy.masks.examine(step, remember=True)
+        return policy, *policy.masks.examine(step, store=True)
 
     policy, maps, _ = examined()
-    factor = policy.looks[1].factor((HEIGHT, WIDTH))
+    factor = policy.priors[1].factor((HEIGHT, WIDTH))
     assert factor.max() > 1.3 and factor.min() < 0.7
     _, alone, _ = examined(first_look=dataclasses.replace(look, weight=1.0))
     assert np.allclose(maps.statistic.numpy(), alone.statistic.numpy() * factor, rtol=1e-5)
@@ -393,7 +393,7 @@ def test_a_mask_is_limited_by_the_photos_first_look(walled):
         shares.append(
             (policy.keep(step_of(walled.data, 1, torch.zeros(HEIGHT, WIDTH, 3))) == 0).float().mean()
         )
-    assert shares[1] <= GAPS * policy.looks[1].most < shares[0], shares
+    assert shares[1] <= GAPS * policy.priors[1].most < shares[0], shares
 
 
 def test_in_a_crowd_nothing_is_masked_that_the_first_look_keeps(walled):

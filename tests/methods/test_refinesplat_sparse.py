@@ -6,7 +6,7 @@ import pytest
 from ambiguous_wild.core import Camera
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
 from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig
-from ambiguous_wild.vision.sparse_surface import seldom_seen, static_surfaces
+from ambiguous_wild.vision.sparse_surface import rarely_covered, static_surfaces
 from tests.methods.on_device import noise
 from tests.methods.test_refinesplat_pixels import (
     PLANE,
@@ -123,7 +123,7 @@ def test_who_has_a_place_in_the_frame_is_counted_one_by_one(least):
     cameras = [looking(rng) for _ in range(8)] + [looking(rng, away=True)]
     surfaces = static_surfaces(cameras, points)
     assert surfaces[-1] is None
-    found = seldom_seen(cameras, surfaces, least)
+    found = rarely_covered(cameras, surfaces, least)
     assert found[-1] is None
     checked = 0
     for view, (few, inverse) in enumerate(zip(found[:-1], surfaces[:-1])):
@@ -152,20 +152,20 @@ def test_outside_the_points_the_nearest_depth_holds_and_one_photo_asks_nobody():
     surface = np.full((H, W), np.nan, np.float32)
     surface[5:9, 30:34] = 1.0 / PLANE
     whole = np.full((H, W), 1.0 / PLANE, np.float32)
-    for a, b in zip(seldom_seen(cameras, [surface] * 3, 2), seldom_seen(cameras, [whole] * 3, 2)):
+    for a, b in zip(rarely_covered(cameras, [surface] * 3, 2), rarely_covered(cameras, [whole] * 3, 2)):
         assert np.array_equal(a, b) and a.any() and not a.all()
-    assert not seldom_seen(cameras[:1], [whole], 2)[0].any()
-    two = seldom_seen(cameras[:2], [whole] * 2, 2)[0]
+    assert not rarely_covered(cameras[:1], [whole], 2)[0].any()
+    two = rarely_covered(cameras[:2], [whole] * 2, 2)[0]
     assert two[:, 0].all() and not two[:, 5:].any()  # one other is all there is
-    assert seldom_seen(cameras[:1], [np.full((H, W), np.nan)], 2) == [None]
+    assert rarely_covered(cameras[:1], [np.full((H, W), np.nan)], 2) == [None]
 
 
 def evidence_of(cameras, surfaces, **config):
     photos = [np.full((H, W, 3), 0.5, np.float32) + 0.1 * noise(i, H, W, 3) for i in range(len(cameras))]
     pixels = pixel_evidence(photos, cameras, surfaces, multiview=MultiViewConfig(**config))
     renders = [noise(9 + view, H, W, 3) for view in range(len(cameras))]
-    for remember in (True, False):  # a view that is looked at before all others has nobody who sees the same
-        found = [looked(pixels, view, render, remember=remember) for view, render in enumerate(renders)]
+    for last in (True, False):  # a view that is looked at before all others has nobody who sees the same
+        found = [looked(pixels, view, render, store=last) for view, render in enumerate(renders)]
     return pixels, found
 
 

@@ -36,16 +36,16 @@ def looked(looks, keep=LEFT_MASKED, size=0.01):
     support = Support(SupportConfig())
     support.match(4, torch.device("cpu"))
     for _ in range(looks):
-        support.look(model(size), VISIBLE, CAMERA, keep)
+        support.observe(model(size), VISIBLE, CAMERA, keep)
     return support
 
 
 def test_hidden_in_every_look_goes_and_the_rest_stays():
-    assert looked(8).judge().tolist() == [True, False, False, False]
+    assert looked(8).unsupported().tolist() == [True, False, False, False]
 
 
 def test_nobody_is_judged_before_enough_looks():
-    assert not looked(7).judge().any()
+    assert not looked(7).unsupported().any()
 
 
 def test_out_of_frame_and_behind_the_camera_are_no_looks():
@@ -55,27 +55,27 @@ def test_out_of_frame_and_behind_the_camera_are_no_looks():
 def test_without_a_mask_everyone_is_vouched_for():
     support = looked(8, None)
     assert support.kept.tolist() == [8, 8, 0, 0]
-    assert not support.judge().any()
+    assert not support.unsupported().any()
 
 
 def test_one_kept_look_in_eight_is_enough():
     support = looked(7)
-    support.look(model(), VISIBLE, CAMERA, None)
-    assert not support.judge().any()
+    support.observe(model(), VISIBLE, CAMERA, None)
+    assert not support.unsupported().any()
 
 
 def test_a_large_one_is_vouched_for_by_its_flanks():
     # 0.25 left of the middle: a standard deviation of 0.3 reaches the kept half, one of 0.2 does not
-    assert looked(8, size=0.2).judge().tolist() == [True, False, False, False]
-    assert not looked(8, size=0.3).judge().any()
+    assert looked(8, size=0.2).unsupported().tolist() == [True, False, False, False]
+    assert not looked(8, size=0.3).unsupported().any()
 
 
 def test_old_evidence_fades():
     support = looked(8, None)
-    support.judge()
+    support.unsupported()
     for _ in range(80):
-        support.look(model(), VISIBLE, CAMERA, LEFT_MASKED)
-        gone = support.judge()
+        support.observe(model(), VISIBLE, CAMERA, LEFT_MASKED)
+        gone = support.unsupported()
         if bool(gone[0]):
             break
     assert gone.tolist() == [True, False, False, False]

@@ -73,7 +73,7 @@ def test_the_histogram_forgets_as_it_should():
 
 def test_bounds_against_loops():
     e = torch.from_numpy(np.random.default_rng(1).random((9, 13)).astype(np.float32))
-    got = masking_common.bound(e, 0.45).numpy()
+    got = masking_common.inlier_map(e, 0.45).numpy()
     inlier = np.pad(e.numpy() < 0.45, 1).astype(float)
     for y in range(9):
         for x in range(13):

@@ -8,7 +8,12 @@ import torch
 
 from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.methods.masking_common import annealed, hashed_uniform, sampled
-from ambiguous_wild.methods.spotlesssplats import PlacedNet, PruningDensity, SpotLessDensityConfig, placed
+from ambiguous_wild.methods.spotlesssplats import (
+    PositionalMaskNet,
+    PruningDensity,
+    SpotLessDensityConfig,
+    positional_encoding,
+)
 from ambiguous_wild.splat.optim import SplatAdam
 from ambiguous_wild.vision.segments import ward_clusters
 from tests.methods.baselines import data_of, masked_more_inside, parts_of, step_of, trained
@@ -73,9 +78,9 @@ def test_hashed_numbers_are_uniform_and_do_not_depend_on_their_neighbours():
 
 
 def test_the_net_is_one_layer_on_features_and_place():
-    net = PlacedNet(torch.zeros(3), torch.ones(3), 4, seed=0)
+    net = PositionalMaskNet(torch.zeros(3), torch.ones(3), 4, seed=0)
     phi = torch.randn(5, 7, 3, generator=torch.Generator().manual_seed(0))
-    x, y = placed(7, phi), placed(5, phi)
+    x, y = positional_encoding(7, phi), positional_encoding(5, phi)
     assert x[3, 0] == pytest.approx(np.sin(np.pi * 0.5)) and x[6, 21] == pytest.approx(np.cos(2 * np.pi))
     inputs = torch.cat([phi, x[None].expand(5, -1, -1), y[:, None].expand(-1, 7, -1)], dim=2)
     weight = torch.cat([net.first.weight, net.place.weight], dim=1)

@@ -8,11 +8,17 @@ import pytest
 import torch
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.methods.forestsplats import fill
-from ambiguous_wild.methods.hybridgs import COVERED, composed, planar_sums
-from ambiguous_wild.methods.nexussplats import GEOMETRY, SHIFT, as_colour, boundary, kept
-from ambiguous_wild.methods.t3dgs import TwoErrorHead, divergence, inverse_depth, likelihood_loss, variation
-from ambiguous_wild.splat.effects.autograd_effect import Visible
+from ambiguous_wild.methods.forestsplats import fill_superpixels
+from ambiguous_wild.methods.hybridgs import COVERED, composite_over, planar_sums
+from ambiguous_wild.methods.nexussplats import GEOMETRY, SHIFT, as_colour, boundary_weight, confident_pixels
+from ambiguous_wild.methods.t3dgs import (
+    TwoErrorHead,
+    divergence,
+    inverse_depth,
+    likelihood_loss,
+    total_variation,
+)
+from ambiguous_wild.splat.effects.autograd_effect import VisibleGaussians
 from ambiguous_wild.splat.fields import STATIC, frames_of
 from ambiguous_wild.splat.gaussians import SH_C0
 from ambiguous_wild.splat.losses import photometric
@@ -82,8 +88,11 @@ def test_gradients_of_the_uncertainty_are_those_of_its_loss(nexus):
         "uncertainty_bias2",
     }
     assert not gradients.sh0.any() and not gradients.screen.any()
-    assert torch.equal(kept(keep), policy.predict(step))
-    assert kept(torch.tensor([1.5, 0.9])).tolist() == [1.0, 0.0] and kept(torch.tensor([0.9])).item() == 1.0
+    assert torch.equal(confident_pixels(keep), policy.predict(step))
+    assert (
+        confident_pixels(torch.tensor([1.5, 0.9])).tolist() == [1.0, 0.0]
+        and confident_pixels(torch.tensor([0.9])).item() == 1.0
+    )
 
 
 def test_the_uncertainty_moves_gaussians_only_if_asked(nexus, monkeypatch):
@@ -132,7 +141,7 @@ def test_dropout_follows_the_hidden_layers_in_training_alone(nexus, view):
     ones["toned_weight0"].zero_(), ones["toned_bias0"].fill_(1.0), ones["toned_weight1"].copy_(torch.eye(8))
     ones["toned_weight2"].fill_(0.01)
     base = torch.zeros(len(g), 3)
-    colours = effect.forward(Visible(base, g.means, g.attributes), ones, context)
+    colours = effect.forward(VisibleGaussians(base, g.means, g.attributes), ones, context)
     # of 8 units each is kept twice with probability 0.8 and then scaled by 1 / 0.8^2
     units = torch.logit((colours[:, 0] + 1) / 2) / 0.01 * (0.64 if view == 0 else 1.0)
     assert units.round().sub(units).abs().max() < 1e-2 and units.max() <= 8.01
@@ -145,12 +154,12 @@ def test_boundaries_widen_what_is_kept_and_not_what_is_learnt(nexus, monkeypatch
     plain, before = policy._weight(step, learn=True)
     monkeypatch.setattr(policy, "config", replace(policy.config, boundary=True))
     wide, after = policy._weight(step, learn=True)
-    torch.testing.assert_close(wide, plain / boundary(*plain.shape, plain))
+    torch.testing.assert_close(wide, plain / boundary_weight(*plain.shape, plain))
     assert torch.equal(before.attributes["nexus_uncertainty"], after.attributes["nexus_uncertainty"])
 
 
 def test_boundaries_weigh_least_at_the_lower_middle():
-    weight = boundary(41, 41, torch.zeros(1))
+    weight = boundary_weight(41, 41, torch.zeros(1))
     assert weight.argmax() == 30 * 41 + 20 and weight[30, 20] == pytest.approx(1.0)
     assert weight[0, 0].item() == pytest.approx(math.exp(-(1.5**2 / 0.5 + 1 / 1.28)))
 
@@ -211,7 +220,7 @@ def test_the_composite_by_hand():
         torch.full((1, 1), 0.25),
         torch.tensor([[[0.4, 1.6, -1.0]]]),
     )
-    assert composed(front, mask, back)[0, 0].tolist() == pytest.approx([0.5, 0.95, 0.2])
+    assert composite_over(front, mask, back)[0, 0].tolist() == pytest.approx([0.5, 0.95, 0.2])
 
 
 def test_stages_share_the_loss_as_described(scene, tmp_path):
@@ -229,7 +238,7 @@ def test_stages_share_the_loss_as_described(scene, tmp_path):
 
     def loss(moved):
         t, m = effect.layer(moved, apart)
-        picture = composed(t, m, apart.rendered.image)
+        picture = composite_over(t, m, apart.rendered.image)
         return photometric(picture, apart.photo).value + 0.05 * m.mean()
 
     planar, gradient = effect._leaf(apart)["planar"], found.effect_grads["hybridgs"]["planar"]
@@ -238,7 +247,7 @@ def test_stages_share_the_loss_as_described(scene, tmp_path):
     assert gradient[at].item() == pytest.approx(slope(loss, planar, at, 2e-3), rel=0.05)
     assert policy.keep(joint) is None
     alone = trainer.drawing(trainer.gaussians, joint, ("hybridgs",)).image
-    torch.testing.assert_close(joint.rendered.image, composed(front, mask, alone))
+    torch.testing.assert_close(joint.rendered.image, composite_over(front, mask, alone))
     assert torch.equal(trainer.render(joint.camera).image, alone)  # no layer in other views
     assert not effect.acts("fit")
 
@@ -294,8 +303,8 @@ def test_the_head_gives_deviations_and_a_correlation():
 
 def test_variation_is_of_the_range():
     ramp = torch.arange(5.0).expand(3, 5)
-    assert variation(ramp).item() == variation(10 * ramp + 3).item() == pytest.approx(0.25)
-    assert variation(torch.full((3, 4), 2.0)).item() == 0.0
+    assert total_variation(ramp).item() == total_variation(10 * ramp + 3).item() == pytest.approx(0.25)
+    assert total_variation(torch.full((3, 4), 2.0)).item() == 0.0
 
 
 def test_masks_of_a_photo_stand_in_after_a_reset(scene, tmp_path):
@@ -319,7 +328,7 @@ def test_depth_is_smoothed(scene, tmp_path):
     alpha, depth = step.rendered.alpha.double(), step.rendered.depth.double()
 
     def loss(moved):
-        return 0.1 * variation(inverse_depth(alpha, moved))
+        return 0.1 * total_variation(inverse_depth(alpha, moved))
 
     at = divmod(int(found.depth.abs().argmax()), 64)
     assert found.depth[at].item() == pytest.approx(slope(loss, depth, at, 1e-6), rel=0.05)
@@ -331,7 +340,7 @@ def test_depth_is_smoothed(scene, tmp_path):
 def test_superpixels_are_filled_by_their_maximum():
     mask = torch.tensor([[0.1, 0.5, 0.0, 0.1], [0.2, 0.3, 0.1, 0.3]])
     segments = torch.tensor([[0, 0, 2, 2], [0, 0, 2, 2]])  # means 0.275 and 0.125
-    found = fill(mask, segments, 4, 0.2)
+    found = fill_superpixels(mask, segments, 4, 0.2)
     assert found[:, :2].tolist() == [[0.5, 0.5]] * 2 and torch.equal(found[:, 2:], mask[:, 2:])
 
 

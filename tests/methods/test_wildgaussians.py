@@ -16,7 +16,7 @@ from ambiguous_wild.methods.wildgaussians import (
     uncertainty_loss,
 )
 from ambiguous_wild.splat.data import load_train_data
-from ambiguous_wild.splat.effects.autograd_effect import Visible
+from ambiguous_wild.splat.effects.autograd_effect import VisibleGaussians
 from ambiguous_wild.splat.step import ViewContext
 from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
@@ -50,7 +50,7 @@ def test_the_formula_by_hand():
     }  # fmt: skip
     hidden = 2.0 * (1.2 + 24 * 0.1 + 32 * 0.2 + 0.5) - 1.0  # both layers are positive
     context = ViewContext(iteration=1, nominal=0, view=0, camera=camera())
-    found = effect.forward(Visible(base, torch.zeros(1, 3), {"wild_embedding": code}), leaf, context)
+    found = effect.forward(VisibleGaussians(base, torch.zeros(1, 3), {"wild_embedding": code}), leaf, context)
     # offset on red, gain on green, blue as it was
     expected = torch.tensor([[0.2 + 0.5 * hidden, (1 + 0.5 * hidden) * 0.4, 0.6]])
     torch.testing.assert_close(found, expected)
@@ -99,7 +99,7 @@ def test_it_masks_what_only_one_photo_shows_and_can_do_without_either_part(tmp_p
     inside, outside = masked_more_inside(trainer)
     assert inside < outside - 0.3, (inside, outside)
     alone = parts_of("wildgaussians", appearance="false")
-    assert not alone.effects and type(alone.mask).__name__ == "Uncertainty"
+    assert not alone.effects and type(alone.mask).__name__ == "UncertaintyMask"
     colours = parts_of("wildgaussians", masks="false")
     assert colours.effects and type(colours.mask).__name__ == "MaskPolicy"
 

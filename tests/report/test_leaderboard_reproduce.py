@@ -14,7 +14,7 @@ import pytest
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import to_plain
-from ambiguous_wild.harness.cell import reproduce
+from ambiguous_wild.harness.cell import reproduce_command
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
@@ -108,7 +108,7 @@ def test_an_own_method_is_named_as_it_was_given(
     Path("own.yaml").write_text("{name: other, train: aw, render: aw, renders: '{output}/{stem}.png'}")
     registry.load_plugin(Path("own.py"))
     (cell,) = plan_cells([given], [write_tiny_scene(tmp_path / "scene")], [0], TrainConfig(iterations=5))
-    line = command(cell.config, (), reproduce(cell))
+    line = command(cell.config, (), reproduce_command(cell))
     assert line.startswith(shlex.join(["aw", "bench", *words, "--scene"])), line
     assert registry.get_method(words[1]).source_hash == cell.config["source"]
     # a stranger's text gives no more than names

@@ -17,7 +17,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.io.files import sha256_file
 from ambiguous_wild.simulate import capture_writer
 from ambiguous_wild.simulate import world as world_module
-from ambiguous_wild.simulate.distractors import DistractorPose, shapes_of
+from ambiguous_wild.simulate.distractors import DistractorPose, distractor_shapes
 from ambiguous_wild.simulate.presets import PRESETS, preset, resized
 from ambiguous_wild.simulate.spec import PLANS
 
@@ -89,7 +89,7 @@ def test_same_seed_same_bytes_on_any_number_of_threads(raw: Path, tmp_path: Path
 
 def test_another_seed_moves_distractors_cameras_and_paint(raw: Path) -> None:
     spec = replace(SMALL, detail_px_per_m=COARSE)
-    one, two = capture_writer.plan(spec, 4), capture_writer.plan(spec, 5)
+    one, two = capture_writer.plan_capture(spec, 4), capture_writer.plan_capture(spec, 5)
     for a, b in zip(one[1], two[1]):
         assert not np.allclose(a.camera.cam_from_world, b.camera.cam_from_world, atol=1e-3)
         assert a.placements != b.placements or a.split == "test"
@@ -153,7 +153,9 @@ def test_exif_states_the_true_focal_length(raw: Path) -> None:
 
 def test_test_viewpoints_are_new_and_inside_the_walk() -> None:
     for seed in range(2):
-        world, shots = capture_writer.plan(replace(SMALL, distractors=(), detail_px_per_m=COARSE), seed)
+        world, shots = capture_writer.plan_capture(
+            replace(SMALL, distractors=(), detail_px_per_m=COARSE), seed
+        )
         hub = np.array([world.hub[0], world.hub[1] - 0.3])
         around = {"train": [], "test": []}
         for shot in shots:
@@ -171,7 +173,7 @@ def test_test_viewpoints_are_new_and_inside_the_walk() -> None:
 def test_no_distractor_keeps_its_place_and_none_stands_in_the_scenery() -> None:
     twin = tuple(d for d in preset("tiny").distractors if d.kind == "twin")
     spec = replace(resized(preset("tiny"), views=14, width=96), detail_px_per_m=COARSE, distractors=twin)
-    world, shots = capture_writer.plan(spec, 1)
+    world, shots = capture_writer.plan_capture(spec, 1)
     spots = np.array([(p.x_m, p.y_m) for s in shots for p in s.placements])
     assert len(spots) > 7
     near = (np.linalg.norm(spots[:, None] - spots[None], axis=2) < 0.3).sum(1)
@@ -219,7 +221,7 @@ def test_a_run_that_breaks_leaves_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("detail", [3.0, 12.0])
 def test_textures_are_finite_and_never_flat_at_any_resolution(detail: float) -> None:
-    world, _ = capture_writer.plan(replace(SMALL, detail_px_per_m=detail, distractors=()), 0)
+    world, _ = capture_writer.plan_capture(replace(SMALL, detail_px_per_m=detail, distractors=()), 0)
     atlas = world.atlas
     assert np.isfinite(atlas.texels).all() and (atlas.texels >= 0).all()
     for name, t in atlas.index.items():
@@ -237,7 +239,7 @@ def test_a_preset_is_found_by_name_and_resized_within_limits() -> None:
 
 def test_a_tint_colours_its_own_sheet_and_leaves_the_head() -> None:
     red = next(d for d in PRESETS["courtyard-plain"].distractors if d.kind == "visitor")
-    shapes = shapes_of(red, DistractorPose(0, 0.0, 0.0, 0.0, 0.5), PLANS["courtyard"])
+    shapes = distractor_shapes(red, DistractorPose(0, 0.0, 0.0, 0.0, 0.5), PLANS["courtyard"])
     assert all(s.tint[1] < 0.1 * s.tint[0] for s in shapes if s.texture == red.texture)
     heads = [s.tint for s in shapes if s.texture == "skin"]
     assert heads and all(t == (1.0, 1.0, 1.0) for t in heads)
@@ -245,7 +247,7 @@ def test_a_tint_colours_its_own_sheet_and_leaves_the_head() -> None:
 
 def test_size_and_lift_move_a_ball_off_the_ground() -> None:
     ball = replace(PRESETS["courtyard-plain"].distractors[1], size=0.25, lift_m=2.0)
-    (shape,) = shapes_of(ball, DistractorPose(1, 0.5, -1.0, 0.0, 0.5), PLANS["courtyard"])
+    (shape,) = distractor_shapes(ball, DistractorPose(1, 0.5, -1.0, 0.0, 0.5), PLANS["courtyard"])
     assert shape.center == pytest.approx((0.5, -1.0, 1.0 + 0.1)) and shape.half == pytest.approx((0.1,) * 3)
     assert shape.owner == 2
 
@@ -253,9 +255,9 @@ def test_size_and_lift_move_a_ball_off_the_ground() -> None:
 def test_a_sheet_that_came_later_changes_no_earlier_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """World of the same seed with and without it: the same light, the same texels under the same names."""
     spec = replace(SMALL, detail_px_per_m=COARSE, distractors=())
-    now, _ = capture_writer.plan(spec, 5)
+    now, _ = capture_writer.plan_capture(spec, 5)
     monkeypatch.delitem(world_module.SHEETS, "cloth")
-    before, _ = capture_writer.plan(spec, 5)
+    before, _ = capture_writer.plan_capture(spec, 5)
     assert np.array_equal(now.light.sun, before.light.sun)
     for name, old in before.atlas.index.items():
         new = now.atlas.index[name]

@@ -20,7 +20,7 @@ from ambiguous_wild.simulate.cutouts import read_cutouts
 from ambiguous_wild.simulate.placement import (
     CompositeConfig,
     local_colours,
-    place,
+    place_cutouts,
     scene_spread,
     visible_points,
 )
@@ -175,7 +175,7 @@ def test_nothing_stays_where_it_was(tmp_path: Path) -> None:
     write_scene(tmp_path / "base", names, points=400)
     scene = load_scene(tmp_path / "base")
     config = replace(CONFIG, presence=1.0)
-    stands = place(visible_points(scene), scene_spread(scene), config, np.random.default_rng(0), 2)
+    stands = place_cutouts(visible_points(scene), scene_spread(scene), config, np.random.default_rng(0), 2)
     for which in range(2):
         spots = np.array([s.position for photo in stands for s in photo if s.which == which])
         assert len(spots) > 0.8 * len(stands)
@@ -190,7 +190,7 @@ def test_nothing_stays_where_it_was(tmp_path: Path) -> None:
 def test_presence_is_the_share_of_photos(base: Path) -> None:
     scene = load_scene(base)
     places = visible_points(scene) * 12
-    stands = place(places, 1e-3, replace(CONFIG, presence=0.4), np.random.default_rng(1), 3)
+    stands = place_cutouts(places, 1e-3, replace(CONFIG, presence=0.4), np.random.default_rng(1), 3)
     share = np.mean([len(s) for s in stands]) / 3
     assert share == pytest.approx(0.4, abs=4 * math.sqrt(0.24 / (3 * len(places))))
 
@@ -215,7 +215,7 @@ def test_patches_go_where_the_photo_is_like_them(base: Path) -> None:
         background[..., 0] = np.where(np.arange(WIDTH) < int(middle), 16.0, 88.0)
     away = {0: np.full(3, 1e6)}
     for lightness, right in ((16.0, False), (88.0, True)):
-        stands = place(places, 1e-3, CONFIG, rng, 1, {0: np.array([lightness, 0, 0])}, around, away)
+        stands = place_cutouts(places, 1e-3, CONFIG, rng, 1, {0: np.array([lightness, 0, 0])}, around, away)
         sides = [
             site.view.camera.project(np.array([s.position]))[0][0, 0] > middle
             for site, group, middle in zip(places, stands, middles, strict=True)
@@ -232,7 +232,7 @@ def test_a_patch_is_never_put_back_where_it_is_from(base: Path) -> None:
     colours = {0: around[0][0, 0]}
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        stands = place(places, spread, CONFIG, rng, 1, colours, around, {0: origin})
+        stands = place_cutouts(places, spread, CONFIG, rng, 1, colours, around, {0: origin})
         for site, group in zip(places, stands, strict=True):
             for s in group:  # it stands before a point, on the ray to it
                 ray = np.asarray(s.position) - site.view.camera.center

@@ -39,7 +39,7 @@ def small(**effects: object) -> CaptureSpec:
 
 @cache
 def planned() -> tuple[World, list[PlannedPhoto]]:
-    return capture_writer.plan(small(), 3)
+    return capture_writer.plan_capture(small(), 3)
 
 
 def taken(spec: CaptureSpec, k: int, seed: int = 3) -> RenderedPhoto:
@@ -64,11 +64,11 @@ def test_what_is_named_is_computed_and_nothing_else(name: str, monkeypatch: pyte
 
         monkeypatch.setattr(fx, function, watched)
 
-    for function in [*(kind for kind in KINDS if kind not in of_hand), "hand_turns"]:
+    for function in [*(kind for kind in KINDS if kind not in of_hand), "camera_rotations"]:
         watch(function)
     made = taken(small(**{kind: getattr(ALL, kind) for kind in wanted}), 1)
     assert set(made.effects) == set(wanted)
-    assert called == {"hand_turns" if kind in of_hand else kind for kind in wanted}
+    assert called == {"camera_rotations" if kind in of_hand else kind for kind in wanted}
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -38,7 +38,7 @@ def test_white_balance_keeps_the_luminance_of_white() -> None:
 
 def test_noise_has_the_stated_variance_and_no_bias() -> None:
     flat = np.full((300, 300, 3), 0.3, np.float32)
-    noisy = fx.iso_noise(flat, fx.pattern(MOMENT, 300, 300), 1600.0)
+    noisy = fx.iso_noise(flat, fx.normal_noise(MOMENT, 300, 300), 1600.0)
     expected = 1.2e-4 * 16 * 0.3 + (5e-4 * 16) ** 2
     assert noisy.var() == pytest.approx(expected, rel=0.02) and noisy.mean() == pytest.approx(0.3, abs=3e-4)
 
@@ -60,28 +60,28 @@ def test_lens_distortion_is_undone_by_the_formula_of_colmap(k1: float, k2: float
 
 
 def test_the_shutter_turns_with_the_hand() -> None:
-    velocity = fx.hand_velocity(MOMENT, 12.0)
+    velocity = fx.camera_angular_velocity(MOMENT, 12.0)
     assert np.deg2rad(3.6) <= np.linalg.norm(velocity) <= np.deg2rad(12.0)
-    rows = fx.hand_turns(velocity, 0.025, 1080)
+    rows = fx.camera_rotations(velocity, 0.025, 1080)
     assert rows.mean(0) == pytest.approx(0, abs=1e-12)
     assert rows[-1] - rows[0] == pytest.approx(velocity * 0.025 * 1079 / 1080)
-    instants = fx.hand_turns(velocity, 0.016, 8)
+    instants = fx.camera_rotations(velocity, 0.016, 8)
     assert instants.sum(0) == pytest.approx(0, abs=1e-12) and len(instants) == 8
     assert instants[-1] - instants[0] == pytest.approx(velocity * 0.016 * 7 / 8)
 
 
 def test_a_turned_pixel_sees_what_the_turned_ray_sees() -> None:
     """Yaw by a: the middle pixel looks at x / z = tan(a)."""
-    points = fx.fine_points(CAMERA, 1)
+    points = fx.subpixel_points(CAMERA, 1)
     turns = np.tile([0.0, 0.02, 0.0], (36, 1))
-    seen = fx.turned(points, turns)
+    seen = fx.rotated_points(points, turns)
     assert seen[..., 0] == pytest.approx(np.tan(np.arctan(points[..., 0]) + 0.02), abs=1e-12)
 
 
 def test_resampling_without_a_move_is_the_mean_of_the_fine_pixels() -> None:
     image = np.random.default_rng(0).random((40 * 2, 68 * 2, 3), dtype=np.float32)
-    source = fx.in_pixels(fx.fine_points(CAMERA, 2), CAMERA)
-    large, border = fx.enlarged(CAMERA, [source], 2)
+    source = fx.to_pixels(fx.subpixel_points(CAMERA, 2), CAMERA)
+    large, border = fx.supersampled_camera(CAMERA, [source], 2)
     assert (large.width, large.height, border) == (66 * 2, 38 * 2, 1)
     same = fx.resample(image[: 38 * 2, : 66 * 2], [source], border, 2)
     inner = image[2 : 2 + 72, 2 : 2 + 128].reshape(36, 2, 64, 2, 3).mean((1, 3))
@@ -89,7 +89,7 @@ def test_resampling_without_a_move_is_the_mean_of_the_fine_pixels() -> None:
 
 
 def test_defocus_spreads_a_point_over_a_disc_and_loses_no_light() -> None:
-    kernel = fx.disc(3.0)
+    kernel = fx.disc_kernel(3.0)
     point = np.zeros((31, 31), np.float32)
     point[15, 15] = 1
     spread = fx.defocus(point, kernel)

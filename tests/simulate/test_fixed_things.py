@@ -15,7 +15,7 @@ from ambiguous_wild.io.photos import Exif
 from ambiguous_wild.simulate.capture_writer import simulate
 from ambiguous_wild.simulate.composite_photos import _write_jpeg, composite_photos
 from ambiguous_wild.simulate.composite_scene import composite
-from ambiguous_wild.simulate.fixed_things import fixed_layer, laid_over
+from ambiguous_wild.simulate.fixed_things import alpha_over, overlay_layer
 from ambiguous_wild.simulate.placement import CompositeConfig
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec import FixedThing
@@ -35,18 +35,18 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_bonnet_covers_the_bottom_and_mirrors_the_scene() -> None:
     dark, light = (np.full((HEIGHT, WIDTH, 3), v, np.float32) for v in (0.0, 0.5))
-    first, second = (fixed_layer("bonnet", photo, 0, 3) for photo in (dark, light))
+    first, second = (overlay_layer("bonnet", photo, 0, 3) for photo in (dark, light))
     assert np.array_equal(first[..., 3], second[..., 3])
     assert first[-1, :, 3].min() == 1.0 and first[: HEIGHT // 2, :, 3].max() == 0.0
     assert 0.17 < first[..., 3].mean() < 0.23
     inside = first[..., 3] == 1.0
     np.testing.assert_allclose((second - first)[inside, :3], 0.1, atol=1e-5)  # a fifth of the scene's light
-    assert not np.array_equal(first, fixed_layer("bonnet", dark, 0, 4))
+    assert not np.array_equal(first, overlay_layer("bonnet", dark, 0, 4))
 
 
 def test_the_digits_of_a_stamp_change_and_its_place_does_not() -> None:
     photo = np.zeros((HEIGHT, WIDTH, 3), np.float32)
-    first, later = (fixed_layer("stamp", photo, number, 0)[..., 3] for number in (0, 7))
+    first, later = (overlay_layer("stamp", photo, number, 0)[..., 3] for number in (0, 7))
     assert not np.array_equal(first, later)
     assert first[: round(0.85 * HEIGHT)].max() == 0.0 and first[:, -2:].max() == 0.0
     assert 0.002 < first.mean() < 0.05
@@ -58,10 +58,10 @@ def test_the_digits_of_a_stamp_change_and_its_place_does_not() -> None:
 def test_layers_add_up_as_light_does() -> None:
     upper = np.array([[[0.2, 0.1, 0.0, 0.5]]], np.float32)
     lower = np.array([[[0.4, 0.4, 0.4, 0.8]]], np.float32)
-    np.testing.assert_allclose(laid_over(upper, lower)[0, 0], [0.4, 0.3, 0.2, 0.9])
+    np.testing.assert_allclose(alpha_over(upper, lower)[0, 0], [0.4, 0.3, 0.2, 0.9])
     photo = np.array([[[1.0, 0.5, 0.25]]], np.float32)
-    twice = laid_over(upper, laid_over(lower, photo))
-    np.testing.assert_allclose(laid_over(laid_over(upper, lower), photo), twice, rtol=1e-6)
+    twice = alpha_over(upper, alpha_over(lower, photo))
+    np.testing.assert_allclose(alpha_over(alpha_over(upper, lower), photo), twice, rtol=1e-6)
 
 
 @pytest.mark.parametrize("thing", ["bonnet", "stamp"])
@@ -78,7 +78,7 @@ def test_every_photo_of_a_capture_has_it(
         mask = read_gray(tmp_path / f"raw/truth/distractor/{name}.png") > 0
         clean = read_png_rgb(tmp_path / f"raw/truth/clean/{name}.png")
         photo = np.asarray(Image.open(tmp_path / f"raw/{'test' if i == 3 else 'train'}/{name}.jpg"))
-        light = fixed_layer(thing, np.zeros(clean.shape, np.float32), i, 2)[..., 3]
+        light = overlay_layer(thing, np.zeros(clean.shape, np.float32), i, 2)[..., 3]
         assert mask[light >= 0.25].all()
         if not patches:
             assert np.array_equal(mask, light >= 0.25)

@@ -11,7 +11,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import capture_writer
 from ambiguous_wild.simulate.capture_writer import look_at
-from ambiguous_wild.simulate.distractors import movers
+from ambiguous_wild.simulate.distractors import distractor_table
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.spec import PLANS, TEXTURES, CaptureSpec
 from ambiguous_wild.simulate.spec_file import dump_spec, parse_spec
@@ -46,14 +46,16 @@ def test_a_wall_is_whole_but_for_its_openings(place):
 
 
 def test_one_looks_out_of_the_windows_and_not_through_the_walls():
-    world = capture_writer.plan(empty("room", views=3), 0)[0]
+    world = capture_writer.plan_capture(empty("room", views=3), 0)[0]
     plan = PLANS["room"]
 
     def depth(along: float, height: float) -> float:
         target = np.array(on_wall(plan, "wall_left", along, height, 0.0))
         eye = np.array([target[0] + 1.5, target[1], 1.5])
         camera = Camera(9, 9, 200.0, 200.0, 4.5, 4.5, look_at(eye, target, 0.0))
-        found = trace(camera, world.table(), movers(empty("room"), (), world), world.atlas, world.light)
+        found = trace(
+            camera, world.table(), distractor_table(empty("room"), (), world), world.atlas, world.light
+        )
         return float(found.depth_m[4, 4])
 
     assert depth(-0.95, 1.5) > 10.0  # the sky
@@ -64,7 +66,7 @@ def test_one_looks_out_of_the_windows_and_not_through_the_walls():
 def test_cameras_are_inside_and_look_where_the_walk_says(name):
     spec = empty(name, views=12)
     for seed in range(3):
-        world, shots = capture_writer.plan(spec, seed)
+        world, shots = capture_writer.plan_capture(spec, seed)
         for shot in shots:
             out = shot.camera.center[:2] - np.array(world.hub[:2])
             ahead = shot.camera.cam_from_world[2, :2]
@@ -78,7 +80,7 @@ def test_cameras_are_inside_and_look_where_the_walk_says(name):
 @pytest.mark.parametrize("name", PLACES)
 def test_distractors_stand_clear_and_cover_what_the_preset_says(name):
     spec = small(name)
-    world, shots = capture_writer.plan(spec, 1)
+    world, shots = capture_writer.plan_capture(spec, 1)
     static = world.table()
     shares = []
     for shot in shots:
@@ -87,7 +89,7 @@ def test_distractors_stand_clear_and_cover_what_the_preset_says(name):
             away = np.hypot(*(world.keep_out[:, :2] - (p.x_m, p.y_m)).T) - world.keep_out[:, 2]
             assert away.min() >= clear and world.plan.gap(p.x_m, p.y_m) >= 0.3 + clear - 1e-9
         if shot.split == "train":
-            table = movers(spec, shot.placements, world)
+            table = distractor_table(spec, shot.placements, world)
             shares.append((trace(shot.camera, static, table, world.atlas, world.light).owner > 0).mean())
     low, high = spec.occlusion
     assert max(shares) <= high + 0.05 and np.mean(shares) >= low + 0.02 * bool(spec.distractors)
@@ -107,7 +109,7 @@ def test_a_place_is_named_in_the_file_and_has_limits_of_its_own():
     with pytest.raises(AwError, match="place"):
         parse_spec("world: {place: beach}")
     with pytest.raises(AwError, match="into a wall of the room"):
-        capture_writer.plan(parse_spec("world: {place: room}\ndetail_px_per_m: 5"), 0)
+        capture_writer.plan_capture(parse_spec("world: {place: room}\ndetail_px_per_m: 5"), 0)
 
 
 def test_every_texture_that_a_spec_may_name_is_painted():

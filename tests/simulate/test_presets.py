@@ -14,7 +14,7 @@ from scipy import ndimage
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import capture_writer
 from ambiguous_wild.simulate.capture_writer import look_at
-from ambiguous_wild.simulate.distractors import DistractorPose, movers
+from ambiguous_wild.simulate.distractors import DistractorPose, distractor_table
 from ambiguous_wild.simulate.presets import PRESETS, resized
 from ambiguous_wild.simulate.shapes import shape_table
 from ambiguous_wild.simulate.spec import VIDEO_WALKS, CaptureSpec, Distractor
@@ -38,10 +38,10 @@ def small(name: str, views: int = 8, width: int = 128) -> CaptureSpec:
 
 def masks(spec: CaptureSpec, seed: int) -> np.ndarray:
     """Owner of every pixel of every train photo, [N, H, W]."""
-    world, shots = capture_writer.plan(spec, seed)
+    world, shots = capture_writer.plan_capture(spec, seed)
     static = world.table()
     seen = [
-        trace(s.camera, static, movers(spec, s.placements, world), world.atlas, world.light).owner
+        trace(s.camera, static, distractor_table(spec, s.placements, world), world.atlas, world.light).owner
         for s in shots
         if s.split == "train"
     ]
@@ -66,7 +66,7 @@ def test_a_seed_repeats_and_another_does_not() -> None:
 @cache
 def empty() -> tuple[CaptureSpec, World]:
     spec = small("still", views=3)
-    return spec, capture_writer.plan(spec, 0)[0]
+    return spec, capture_writer.plan_capture(spec, 0)[0]
 
 
 @cache
@@ -76,7 +76,7 @@ def only(distractor: Distractor) -> tuple[np.ndarray, float]:
     spec = replace(spec, distractors=(distractor,))
     eye, f = np.array([0.0, -4.5, 1.2]), 400.0
     camera = Camera(560, 560, f, f, 280.0, 280.0, look_at(eye, np.array([0.0, -2.0, 1.2]), 0.0))
-    here = movers(spec, (DistractorPose(0, 0.0, -2.0, 0.0, 0.4),), world)
+    here = distractor_table(spec, (DistractorPose(0, 0.0, -2.0, 0.0, 0.4),), world)
     nothing = shape_table((), world.atlas)
     return trace(camera, nothing, here, world.atlas, world.light).owner > 0, f / 2.5
 
@@ -111,11 +111,13 @@ def test_a_thin_one_reaches_far_across_the_photo() -> None:
 def test_plain_colours_are_nothing_elses() -> None:
     """In the picture, the visitor's and the ball's pixels lie far from every colour of the courtyard."""
     spec = small("courtyard-plain")
-    world, shots = capture_writer.plan(spec, 2)
+    world, shots = capture_writer.plan_capture(spec, 2)
     static = world.table()
     share = []
     for shot in shots[: spec.train_views]:
-        seen = trace(shot.camera, static, movers(spec, shot.placements, world), world.atlas, world.light)
+        seen = trace(
+            shot.camera, static, distractor_table(spec, shot.placements, world), world.atlas, world.light
+        )
         for which, channel in ((0, 0), (1, 2)):  # red, blue
             pure = seen.distracted[..., channel] > 2.5 * np.delete(seen.distracted, channel, -1).max(-1)
             there = seen.owner == which + 1
@@ -130,7 +132,7 @@ def test_consecutive_photos_of_a_video_are_close(name: str) -> None:
     """Steps of cameras and people are small and alike, and the next photo shows 75 % of a photo."""
     spec = small(name, views=PRESETS[name].train_views, width=64)
     for seed in range(2):
-        world, shots = capture_writer.plan(spec, seed)
+        world, shots = capture_writer.plan_capture(spec, seed)
         train = [s for s in shots if s.split == "train"]
         assert [s.name for s in train] == sorted(s.name for s in train)
         steps = np.linalg.norm(np.diff([s.camera.center for s in train], axis=0), axis=1)

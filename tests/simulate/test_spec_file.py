@@ -9,7 +9,7 @@ from click.testing import CliRunner, Result
 
 from ambiguous_wild.cli.simulate import simulate_command as command
 from ambiguous_wild.core import AwError
-from ambiguous_wild.simulate.capture_writer import plan
+from ambiguous_wild.simulate.capture_writer import plan_capture
 from ambiguous_wild.simulate.presets import PRESETS
 from ambiguous_wild.simulate.spec_file import dump_spec, parse_spec, read_spec
 
@@ -186,7 +186,7 @@ def test_a_hand_that_looks_too_far_away_is_refused_before_memory_is_asked_for(tm
 
 def test_a_walk_into_a_wall_is_refused() -> None:
     with pytest.raises(AwError, match="lead the camera into a wall"):
-        plan(parse_spec("radius_m: [7, 7]\narc_deg: 150\ndetail_px_per_m: 5"), 0)
+        plan_capture(parse_spec("radius_m: [7, 7]\narc_deg: 150\ndetail_px_per_m: 5"), 0)
 
 
 @pytest.mark.parametrize(("occlusion", "word"), [("[0.8, 0.9]", "in 3 of 3 train photos"), ("[0, 0.9]", "")])
@@ -205,6 +205,6 @@ def test_presence_is_of_photos_where_the_band_starts_at_nothing() -> None:
         "train_views: 30\nwidth: 64\nheight: 36\ndetail_px_per_m: 5\nocclusion: [0, 0.1]\n"
         "distractors: [{kind: ball, name: a, texture: cloth, ambiguity: none, presence: 0.3}]"
     )
-    shots = [s for s in plan(spec, 1)[1] if s.split == "train"]
+    shots = [s for s in plan_capture(spec, 1)[1] if s.split == "train"]
     there = sum(bool(s.placements) for s in shots)
     assert 4 <= there <= 14  # 9 are expected, 2.5 is a deviation

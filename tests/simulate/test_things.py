@@ -11,13 +11,13 @@ from PIL import Image
 from ambiguous_wild.core.camera import Camera
 from ambiguous_wild.simulate import capture_writer, shapes
 from ambiguous_wild.simulate.capture_writer import look_at
-from ambiguous_wild.simulate.distractors import DistractorPose, lay_out, shapes_of
+from ambiguous_wild.simulate.distractors import DistractorPose, distractor_shapes, place_distractors
 from ambiguous_wild.simulate.kernels import QUAD, VOLUME
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.shapes import UNSEEN, Shape, shape_table
 from ambiguous_wild.simulate.spec import PLANS, STATUES, Distractor, Thing, WorldSpec
 from ambiguous_wild.simulate.tracer import Light, build_atlas, trace
-from ambiguous_wild.simulate.world import circle_of, shapes_of_thing
+from ambiguous_wild.simulate.world import thing_footprint, thing_shapes
 
 ATLAS = build_atlas({"stone": np.full((4, 4, 3), 0.5, np.float32)})
 LIGHT = Light(np.array([[0.0, -0.6, 0.8]]), np.ones(3), np.full(3, 0.3), np.full(3, 0.3))
@@ -81,14 +81,16 @@ def test_a_thing_stands_on_the_ground_at_its_place(kind: str) -> None:
     camera = Camera(
         90, 150, 150.0, 150.0, 45.0, 75.0, look_at(np.array([0.5, -7.0, 0.8]), np.array([0.5, -1, 0.8]), 0.0)
     )
-    things = shape_table([replace(s, owner=1) for s in shapes_of_thing(thing, PLANS["courtyard"])], ATLAS)
+    things = shape_table([replace(s, owner=1) for s in thing_shapes(thing, PLANS["courtyard"])], ATLAS)
     rows, columns = np.nonzero(trace(camera, shape_table([], ATLAS), things, ATLAS, LIGHT).owner)
     scale = 150.0 / 6.0
     top, foot = (75 - rows.min()) / scale + 0.8, (74 - rows.max()) / scale + 0.8
     assert foot == pytest.approx(0.0, abs=0.12) and 1.3 < top < 1.75
     assert (columns.min() + columns.max()) / 2 == pytest.approx(45, abs=5)
-    assert circle_of(thing)[:2] == (0.5, -1.0)
-    assert circle_of(replace(thing, at_m=(0.5, -1.0, 2.0)))[2] == 0 < circle_of(thing)[2]  # above all heads
+    assert thing_footprint(thing)[:2] == (0.5, -1.0)
+    assert (
+        thing_footprint(replace(thing, at_m=(0.5, -1.0, 2.0)))[2] == 0 < thing_footprint(thing)[2]
+    )  # above all heads
 
 
 def test_a_walker_keeps_to_its_way_and_speed() -> None:
@@ -106,7 +108,7 @@ def test_a_walker_keeps_to_its_way_and_speed() -> None:
     spec = replace(
         resized(preset("walkers"), views=9, width=64), distractors=(walker,), detail_px_per_m=6.0, samples=1
     )
-    world, shots = capture_writer.plan(spec, 0)
+    world, shots = capture_writer.plan_capture(spec, 0)
     x = [s.placements[0].x_m for s in shots[:9]]
     assert x == pytest.approx([-3, -1.5, 0, 1.5, 3, 1.5, 0, -1.5, -3], abs=1e-9)
     assert {round(s.placements[0].y_m, 6) for s in shots[:9]} == {-2.0}
@@ -117,11 +119,11 @@ def test_a_walker_keeps_to_its_way_and_speed() -> None:
     assert yaws == ({90}, {270})
     shy = replace(spec, distractors=(replace(walker, distance_m=(3.0, 4.5)),))
     cameras = [s.camera for s in shots[:9]]
-    there = lay_out(shy, cameras, world, np.random.default_rng(0))
+    there = place_distractors(shy, cameras, world, np.random.default_rng(0))
     away = [np.hypot(*(c.center[:2] - (at, -2.0))) for c, at in zip(cameras, x)]
     assert [bool(p) for p in there] == [d >= 3.0 for d in away] and 0 < sum(map(bool, there)) < 9
     rare = replace(spec, distractors=(replace(walker, presence=0.3),))
-    placed = lay_out(rare, cameras, world, np.random.default_rng(0))
+    placed = place_distractors(rare, cameras, world, np.random.default_rng(0))
     assert 0 < sum(bool(p) for p in placed) < 9
 
 
@@ -135,7 +137,7 @@ def test_who_stands_keeps_its_place_and_a_visitor_turns_and_bends() -> None:
         detail_px_per_m=6.0,
         samples=1,
     )
-    _, shots = capture_writer.plan(spec, 0)
+    _, shots = capture_writer.plan_capture(spec, 0)
     placements = [shot.placements for shot in shots[:9]]
     for which, x, turns in ((0, -1.0, 9), (1, 1.0, 1)):
         of = [p for group in placements for p in group if p.which == which]
@@ -167,8 +169,8 @@ def front(shapes: list[Shape]) -> np.ndarray:
 def test_who_is_blurred_moves_where_it_faces_during_the_exposure(kind: str, yaw: float) -> None:
     still = Distractor("d", kind, "cloth", "none")  # type: ignore[arg-type]
     place = DistractorPose(0, 0.5, -1.0, yaw, 0.3)
-    whole = shapes_of(still, place, PLANS["yard"])
-    moving = shapes_of(replace(still, blur_m=0.8), place, PLANS["yard"])
+    whole = distractor_shapes(still, place, PLANS["yard"])
+    moving = distractor_shapes(replace(still, blur_m=0.8), place, PLANS["yard"])
     centres = np.array([[s.center for s in moving if s.instant == k] for k in range(4)])
     assert len(moving) == 4 * len(whole)
     assert centres.mean(0) == pytest.approx(np.array([s.center for s in whole]))
@@ -182,18 +184,18 @@ def test_a_car_that_drives_faces_its_way() -> None:
                      waypoints=((-3.0, -2.0), (3.0, 1.0)))  # fmt: skip
     spec = replace(resized(preset("walkers"), views=8, width=64), distractors=(car,), detail_px_per_m=6.0)
     spec = replace(spec, samples=1, world=WorldSpec(furniture=False, statue=False))
-    _, shots = capture_writer.plan(spec, 0)
+    _, shots = capture_writer.plan_capture(spec, 0)
     places = [shot.placements[0] for shot in shots[:8]]  # 0 to 3 there, 4 to 7 back
     ways = np.diff([(p.x_m, p.y_m) for p in places], axis=0)
     for k in (0, 1, 2, 4, 5, 6):
-        ahead = front(shapes_of(car, places[k], PLANS["courtyard"]))
+        ahead = front(distractor_shapes(car, places[k], PLANS["courtyard"]))
         assert ahead == pytest.approx(ways[k] / np.linalg.norm(ways[k]), abs=1e-6), k
     assert ways[0] @ ways[6] < 0
 
 
 def test_one_whom_the_camera_follows_sways_in_front_of_it_and_is_seen_from_behind() -> None:
     spec = replace(resized(preset("followed"), width=64), detail_px_per_m=6.0, samples=1)
-    _, shots = capture_writer.plan(spec, 0)
+    _, shots = capture_writer.plan_capture(spec, 0)
     low, high = spec.distractors[0].distance_m
     angles, away = [], []
     for shot in shots[: spec.train_views]:
@@ -214,8 +216,8 @@ def test_zoom_varies_the_focal_length_in_photo_truth_and_exif(tmp_path) -> None:
     spec = replace(resized(preset("zoom"), views=6, width=64), detail_px_per_m=6.0, samples=1, distractors=())
     spec = replace(spec, occlusion=(0.0, 0.0))
     capture_writer.simulate(spec, tmp_path / "raw")
-    _, shots = capture_writer.plan(spec, 0)
-    base = capture_writer.plan(replace(spec, zoom=(1.0, 1.0)), 0)[1]
+    _, shots = capture_writer.plan_capture(spec, 0)
+    base = capture_writer.plan_capture(replace(spec, zoom=(1.0, 1.0)), 0)[1]
     factors = [s.camera.fx / b.camera.fx for s, b in zip(shots, base)]
     assert min(factors) < 1.0 and max(factors) > 1.6 and all(0.85 <= f <= 1.9 for f in factors)
     for shot in shots:

@@ -10,12 +10,19 @@ import pytest
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.srgb import linear_to_srgb, srgb_to_linear
 from ambiguous_wild.simulate import tracer
-from ambiguous_wild.simulate.capture_writer import look_at, plan
+from ambiguous_wild.simulate.capture_writer import look_at, plan_capture
 from ambiguous_wild.simulate.image_effects import PhotoRandom
 from ambiguous_wild.simulate.kernels import BOX, CAPSULE, CYLINDER, ELLIPSOID, FAR, PLANAR, QUAD, _intersect
 from ambiguous_wild.simulate.photo_render import compile_tracer, prepare_photo, trace_photo
 from ambiguous_wild.simulate.presets import preset, resized
-from ambiguous_wild.simulate.shapes import UNSEEN, Shape, between, bounding_radius, placed, shape_table
+from ambiguous_wild.simulate.shapes import (
+    UNSEEN,
+    Shape,
+    bounding_radius,
+    capsule_between,
+    shape_table,
+    transformed,
+)
 from ambiguous_wild.simulate.tracer import Light, build_atlas, trace
 
 HALF = (0.5, 0.5, 0.8)
@@ -60,7 +67,7 @@ def _scene() -> tuple[list[Shape], list[Shape], Light, dict[str, np.ndarray]]:
     textures = {n: rng.uniform(0.1, 0.9, (64, 64, 3)).astype(np.float32) for n in ("floor", "thing")}
     floor = Shape(QUAD, (0, 0, 0), (6, 6, 0), "floor", mapping=PLANAR, casts=False)
     ball = Shape(ELLIPSOID, (0.4, 0.3, 0.6), (0.6, 0.5, 0.6), "thing")
-    post = between((-1, 0, 0), (-1.1, 0.3, 1.5), 0.2, "thing")
+    post = capsule_between((-1, 0, 0), (-1.1, 0.3, 1.5), 0.2, "thing")
     sun = np.tile(np.array([0.4, -0.5, 0.77]) / np.linalg.norm([0.4, -0.5, 0.77]), (4, 1))
     light = Light(sun, np.ones(3), np.full(3, 0.5), np.full(3, 0.3))
     return [floor, ball], [replace(post, owner=1)], light, textures
@@ -142,8 +149,8 @@ def test_colour_transfer_goes_there_and_back() -> None:
 
 
 def test_placing_keeps_distances() -> None:
-    parts = [between((0, 0, 0), (0, 0.5, 1), 0.1, "x"), Shape(BOX, (1, 0, 0), (0.1, 0.2, 0.3), "x")]
-    moved = placed(parts, (3, -2, 1), 57.0, 2.0)
+    parts = [capsule_between((0, 0, 0), (0, 0.5, 1), 0.1, "x"), Shape(BOX, (1, 0, 0), (0.1, 0.2, 0.3), "x")]
+    moved = transformed(parts, (3, -2, 1), 57.0, 2.0)
     gap = np.linalg.norm(np.subtract(parts[0].center, parts[1].center))
     assert np.linalg.norm(np.subtract(moved[0].center, moved[1].center)) == pytest.approx(2 * gap)
     for shape in moved:
@@ -154,7 +161,7 @@ def test_placing_keeps_distances() -> None:
 def test_the_kernels_that_are_compiled_ahead_are_those_of_a_capture():
     compile_tracer()
     spec = resized(preset("tiny"), views=3, width=64)
-    world, photos = plan(spec, 0)
+    world, photos = plan_capture(spec, 0)
     random = PhotoRandom(0, 0, 0.0)
     trace_photo(world, prepare_photo(spec, world, photos[0], random))
     assert len(tracer._tiles.signatures) == 1
@@ -242,7 +249,7 @@ def test_who_moves_during_the_exposure_is_there_at_each_instant_for_a_quarter_of
 
 def test_shadows_of_distractors_darken_what_the_truth_says_and_nothing_else() -> None:
     spec = replace(resized(preset("tiny"), views=4, width=128), detail_px_per_m=5.0, cast_shadows=True)
-    world, shots = plan(spec, 4)
+    world, shots = plan_capture(spec, 4)
     assert spec.has_shadows
     shares = []
     for number, shot in enumerate(shots[:4]):

@@ -41,7 +41,7 @@ LENS = replace(SPEC, effects=Effects(lens_distortion=LensDistortion(-0.12)))
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, World]:
     out = tmp_path_factory.mktemp("numbers") / "raw"
     capture_writer.simulate(request.param, out, seed=2)
-    return out, capture_writer.plan(request.param, 2)[0]
+    return out, capture_writer.plan_capture(request.param, 2)[0]
 
 
 def cameras(raw: Path) -> dict[str, dict]:

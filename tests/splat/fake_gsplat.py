@@ -10,7 +10,7 @@ import types
 
 import torch
 
-from ambiguous_wild.splat import backend, gsplat_seam
+from ambiguous_wild.splat import backend, gsplat_calls
 from ambiguous_wild.splat.reference import harmonics, rotations
 
 _BOX = 3.33  # deviations a radius has at most
@@ -163,5 +163,5 @@ def installed(monkeypatch):
 
 
 def _forget():
-    for what in (gsplat_seam.gsplat, gsplat_seam.max_alpha):
+    for what in (gsplat_calls.gsplat, gsplat_calls.max_alpha):
         what.cache_clear()

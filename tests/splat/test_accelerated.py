@@ -99,7 +99,7 @@ def test_the_step_that_broke_is_made_again_with_its_own_keep_map(scene, tmp_path
         for _ in range(12):
             trainer.step()
     assert mask.calls == 24  # nobody asks the policy again
-    keep = info.value.seen["keep"]
+    keep = info.value.tensors["keep"]
     expected = torch.full_like(keep, 1.0 / 13)  # of its call in step 7
     if where == "keep":
         expected[20, 30] = math.nan
@@ -128,7 +128,7 @@ def test_what_breaks_is_found_later_and_named_as_if_at_once(scene, tmp_path, fak
     parts = MethodHooks(mask=Poison([bad]))
     trainer = trainer_for(scene, tmp_path / "run", parts=parts, iterations=60, probes=0)
     trainer.watchdog.every = 15
-    view = scene.train[trainer.pace.view(bad)].name
+    view = scene.train[trainer.run_schedule.view(bad)].name
     before = None
     while trainer.iteration < 14:
         if trainer.iteration == bad - 1:
@@ -169,11 +169,11 @@ def test_a_photo_that_is_all_masked_moves_nothing_and_is_said(scene, tmp_path, f
         before = trainer.gaussians.clone()
         seen = trainer.density.views_seen.clone()
         trainer.step()
-        if trainer.pace.view(iteration) == 2 and len(seen):
+        if trainer.run_schedule.view(iteration) == 2 and len(seen):
             assert torch.equal(trainer.density.views_seen, seen)  # nobody was looked at
         assert mask.last.rendered.visible.any()  # what the method was shown does not change
         same = all(torch.equal(t, getattr(before, name)) for name, t in trainer.gaussians.items())
-        moved[trainer.pace.view(iteration)] = not same
+        moved[trainer.run_schedule.view(iteration)] = not same
     assert moved == {view: view != 2 for view in range(6)}
     assert trainer.skipped_views == [scene.train[2].name]
     trainer.save()

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat import gsplat_seam
+from ambiguous_wild.splat import gsplat_calls
 from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.gpu_render import on_device
 from ambiguous_wild.splat.reference import render_reference
@@ -82,7 +82,7 @@ def test_the_clamp_is_measured(fake, monkeypatch, clamp):
     monkeypatch.setattr(fake_gsplat, "MAX_ALPHA", clamp)
     g, cam = gaussians(5), camera()
     g.opacity_logits[:] = 9.0
-    assert gsplat_seam.max_alpha("cpu") == clamp
+    assert gsplat_calls.max_alpha("cpu") == clamp
     image = render(g, cam, sh_degree=0).image
     truth, other = (
         render_reference(doubles(g), cam, sh_degree=0, max_alpha=m).image for m in (clamp, 0.9945)
@@ -114,13 +114,13 @@ def test_pictures_carry_no_graph_and_gaussians_are_left_alone(fake):
 def test_a_second_cotangent_comes_back_once_more_through_the_pixels_alone(fake, monkeypatch):
     calls = {"project": 0, "blend": 0}
     for name in calls:
-        original = getattr(gsplat_seam, name)
+        original = getattr(gsplat_calls, name)
 
         def counted(*a, _name=name, _original=original, **k):
             calls[_name] += 1
             return _original(*a, **k)
 
-        monkeypatch.setattr(gsplat_seam, name, counted)
+        monkeypatch.setattr(gsplat_calls, name, counted)
     g, cam = gaussians(8), camera()
     d = cotangents(cam.height, cam.width)
     rendered = render(g, cam)
@@ -161,6 +161,6 @@ def test_without_gsplat_the_error_names_the_command(monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    gsplat_seam.gsplat.cache_clear()
+    gsplat_calls.gsplat.cache_clear()
     with pytest.raises(AwError, match=r"gsplat is not installed: .*pip install .*cuda"):
         render(gaussians(0).to("meta"), camera())

@@ -112,7 +112,7 @@ def test_a_dense_start_leaves_room_to_grow(scene, tmp_path, monkeypatch):
     pixels = float(np.median([p.shape[0] * p.shape[1] for p in plain.data.photos]))
     free = trainer_for(scene, tmp_path / "free", ("dense",))
     assert len(free.gaussians.means) <= START_SHARE * pixels
-    assert free.pace.most == plain.pace.most
+    assert free.run_schedule.max_gaussians == plain.run_schedule.max_gaussians
     full = trainer_for(scene, tmp_path / "full", ("dense",), max_gaussians=sparse)
     assert len(full.gaussians.means) == sparse and len(asked) == 2  # no room
 

@@ -16,7 +16,7 @@ from ambiguous_wild.splat.effects.effect_pipeline import EffectPipeline
 from ambiguous_wild.splat.effects.poses import PoseRefinement, left_jacobian, so3_exp
 from ambiguous_wild.splat.effects.smoothing import filter_sizes
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.rendered import NOTHING, Gradients, as_cotangents
+from ambiguous_wild.splat.rendered import NO_STATISTICS, Gradients, as_cotangents
 from ambiguous_wild.splat.step import TrainData, ViewContext
 from tests.host_reads import READ, moved, on_accelerator
 from tests.splat.scenes import camera as make_camera
@@ -64,7 +64,7 @@ class Painted:
         self.alpha = self.depth = self.image[..., 0]
         self.visible, self.radii = gaussians.means[:, 0] > -9.0, gaussians.means[:, 0]
 
-    def backward(self, cotangents, needs=NOTHING):
+    def backward(self, cotangents, needs=NO_STATISTICS):
         given = as_cotangents(cotangents)
         found = torch.autograd.grad(self.drawn, list(self.leaves.values()), given.image)
         leaves = dict(zip(self.leaves, found))

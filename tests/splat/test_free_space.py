@@ -130,7 +130,7 @@ def test_photos_without_long_tracks_have_no_free_space():
 
 def test_points_of_the_user_are_all_started_from():
     data = capture((1.0, 0.0, 5.9), (0, 1))
-    hooks = MethodHooks(given=(data.scene.points.xyz, data.scene.points.rgb))
+    hooks = MethodHooks(user_start=(data.scene.points.xyz, data.scene.points.rgb))
     start = hooks.first_gaussians(data)
     assert isinstance(start, Gaussians) and len(start) == 41
 

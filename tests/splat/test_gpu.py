@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ambiguous_wild.methods import get_method
-from ambiguous_wild.splat import gsplat_seam
+from ambiguous_wild.splat import gsplat_calls
 from ambiguous_wild.splat.cpu.cpu_render import render_cpu
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.losses import photometric
@@ -89,7 +89,7 @@ def test_a_step_waits_for_nothing_but_the_tiles(scene, tmp_path, monkeypatch, me
     trainer.watchdog.every = 10**9
     for _ in range(40):
         trainer.step()
-    sort = gsplat_seam.sort
+    sort = gsplat_calls.sort
 
     def waits(*arguments):
         torch.cuda.set_sync_debug_mode("default")
@@ -97,7 +97,7 @@ def test_a_step_waits_for_nothing_but_the_tiles(scene, tmp_path, monkeypatch, me
         torch.cuda.set_sync_debug_mode("error")
         return found
 
-    monkeypatch.setattr(gsplat_seam, "sort", waits)
+    monkeypatch.setattr(gsplat_calls, "sort", waits)
     counts = {"made": 0}
     if method in ("robustsplat", "refinesplat"):
         # what is meant to run does: the net's steps, the masks that are made anew

@@ -45,7 +45,7 @@ def test_gsplats_loop_learns(gpu, tmp_path):
 
     args = argparse.Namespace(scene=write_tiny_scene(tmp_path / "scene"), work=tmp_path, device="cpu")
     ours = gpu.trainer_of(args, "3dgs", 100)
-    plain = gpu.PlainLoop(ours.gaussians, ours.data, ours.pace.learning_rates(0.0))
+    plain = gpu.PlainLoop(ours.gaussians, ours.data, ours.run_schedule.learning_rates(0.0))
     first = float(plain.step())
     for name, parameter in plain.parameters.items():
         assert not torch.equal(parameter.detach(), getattr(ours.gaussians, name)) or name == "quats", name

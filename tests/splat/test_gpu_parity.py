@@ -109,10 +109,10 @@ def test_every_size_of_the_run_is_compiled_before_it_starts(scene, tmp_path, fak
 
     monkeypatch.setattr(gpu_kernels, "compiles", lambda device: True)
     monkeypatch.setattr(gpu_kernels, "photometric_fused", record)
-    monkeypatch.setattr("ambiguous_wild.splat.pace.SMALLEST_SIDE", 10)
+    monkeypatch.setattr("ambiguous_wild.splat.run_schedule.SMALLEST_SIDE", 10)
     gpu_kernels.prepare.cache_clear()
     trainer = trainer_for(scene, tmp_path, iterations=30, probes=0, resolution="coarse-to-fine")
-    sizes = {(48 // d, 64 // d) for d in trainer.pace.factors}
+    sizes = {(48 // d, 64 // d) for d in trainer.run_schedule.factors}
     assert len(sizes) > 1
     assert sorted(seen) == sorted((*size, masked) for size in sizes for masked in (False, True))
     before = len(seen)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.methods.swag import hash_encoding, in_torch
+from ambiguous_wild.methods.swag import hash_encoding, hash_encoding_torch
 from ambiguous_wild.splat.cpu.compile import one_thread
 
 
@@ -33,7 +33,7 @@ def test_kernel_and_torch_agree_and_so_do_their_gradients():
     found = []
     for encode in (
         lambda g: hash_encoding(unit, g, 4, 1.5),
-        lambda g: in_torch(unit, g, [4.0, 6.0, 9.0, 13.0]),
+        lambda g: hash_encoding_torch(unit, g, [4.0, 6.0, 9.0, 13.0]),
     ):
         own = grid.clone().requires_grad_()
         values = encode(own)

@@ -55,12 +55,12 @@ def near(seen_by=("a",)) -> NearSpace:
     ],
 )
 def test_what_lies_nearer_than_the_points(place, held):
-    assert near().holds(torch.tensor([place])).tolist() == [held]
+    assert near().contains(torch.tensor([place])).tolist() == [held]
 
 
 def test_every_camera_that_sees_points_says_so():
     inside = torch.tensor([[100.0, 0.0, 1.0]])
-    assert near(seen_by=("a", "b")).holds(inside).all()
+    assert near(seen_by=("a", "b")).contains(inside).all()
 
 
 def test_it_becomes_transparent_at_intervals():
@@ -82,7 +82,7 @@ def started(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(near_space, "FEW_POINTS", 1)
     monkeypatch.setattr(near_space, "SHARE", 1.0)  # Gaussians that leave the wall are in the way
     every = lambda scene: [np.arange(len(scene.points))] * len(scene.train)  # noqa: E731
-    monkeypatch.setattr(near_space, "tracks_of", every)  # the tiny scene has no tracks
+    monkeypatch.setattr(near_space, "point_indices_by_photo", every)  # the tiny scene has no tracks
 
     def start(folder, effects=("near",), iterations=260):
         parts = with_effects(MethodHooks(), list(effects))

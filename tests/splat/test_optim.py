@@ -135,7 +135,7 @@ COPIES = {
     "select": lambda g: g.select(ALL_ROWS),
     "cat": lambda g: g.cat(gaussians(4, 3)).select(torch.arange(50)),
     "cat to others": lambda g: gaussians(4, 3).cat(g).select(torch.arange(3, 53)),
-    "clone of what is carried on": lambda g: g.carrying({"more": torch.zeros(50)}).clone(),
+    "clone of what is carried on": lambda g: g.with_attributes({"more": torch.zeros(50)}).clone(),
 }
 
 

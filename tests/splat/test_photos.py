@@ -12,15 +12,15 @@ from ambiguous_wild.io.images import load_image_float, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.splat import data as data_module
 from ambiguous_wild.splat.data import (
-    READY,
-    RESIDENT,
-    CudaCopies,
-    HostReads,
+    PHOTOS_ON_DEVICE,
+    RESIDENT_SHARE,
+    CudaPhotoTransfer,
+    HostPhotoTransfer,
     KeepMaps,
-    Photos,
-    Pyramid,
+    PhotoPyramid,
+    PrefetchedPhotos,
     load_train_data,
-    room,
+    photo_memory,
     shrink,
 )
 from tests.tiny_scene import write_tiny_scene
@@ -58,7 +58,7 @@ def expected(codes):
 
 
 def test_they_are_a_sequence_of_what_the_host_would_have_made(codes):
-    photos = Photos(codes, CPU, SlowCopies())
+    photos = PrefetchedPhotos(codes, CPU, SlowCopies())
     assert len(photos) == 7
     for got, wanted in zip(photos, expected(codes), strict=True):
         assert got.dtype == torch.float32 and torch.equal(got, wanted)
@@ -71,12 +71,12 @@ def test_they_are_a_sequence_of_what_the_host_would_have_made(codes):
 
 def test_photos_of_more_than_eight_bits_stay_what_they_are():
     deep = torch.rand(2, 2, 3)
-    assert torch.equal(Photos([deep], CPU, SlowCopies())[0], deep)
+    assert torch.equal(PrefetchedPhotos([deep], CPU, SlowCopies())[0], deep)
 
 
 def test_one_sent_ahead_is_not_sent_again_and_is_waited_for_when_it_is_read(codes):
     copies = SlowCopies()
-    photos = Photos(codes, CPU, copies)
+    photos = PrefetchedPhotos(codes, CPU, copies)
     photos.prefetch(3)
     photos.prefetch(3)
     assert len(copies.begun) == 1 and copies.begun[0] is codes[3] and copies.finished == 0
@@ -88,14 +88,14 @@ def test_one_sent_ahead_is_not_sent_again_and_is_waited_for_when_it_is_read(code
 
 
 def test_few_lie_on_the_device_at_a_time(codes):
-    photos = Photos(codes, CPU, SlowCopies())
+    photos = PrefetchedPhotos(codes, CPU, SlowCopies())
     for index in range(7):
         photos.prefetch((index + 1) % 7)
         assert torch.equal(photos[index], expected(codes)[index])
-    assert list(photos._ready) == [4, 5, 6] and READY == 3
+    assert list(photos._ready) == [4, 5, 6] and PHOTOS_ON_DEVICE == 3
     for index in range(7):
         photos.prefetch(index)
-    assert len(photos._coming) <= READY
+    assert len(photos._coming) <= PHOTOS_ON_DEVICE
     assert all(torch.equal(photos[i], e) for i, e in enumerate(expected(codes)))
 
 
@@ -122,7 +122,8 @@ def test_on_the_cpu_photos_are_a_plain_list(scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("copies", "memory", "held"), [(HostReads, 5.0, 6), (HostReads, 0.6, 2), (SlowCopies, 0.6, 6)]
+    ("copies", "memory", "held"),
+    [(HostPhotoTransfer, 5.0, 6), (HostPhotoTransfer, 0.6, 2), (SlowCopies, 0.6, 6)],
 )
 def test_photos_that_do_not_fit_are_brought_when_they_are_read(
     scene, tmp_path, monkeypatch, copies, memory, held
@@ -130,8 +131,8 @@ def test_photos_that_do_not_fit_are_brought_when_they_are_read(
     """Of a machine with room for some photos as codes: the others are read from their files again."""
     resident = load(scene, tmp_path).photos
     codes = 48 * 64 * 3
-    monkeypatch.setattr(data_module, "usable_memory", lambda: memory * 4 * codes / RESIDENT)
-    monkeypatch.setattr(data_module, "HostReads", copies)
+    monkeypatch.setattr(data_module, "usable_memory", lambda: memory * 4 * codes / RESIDENT_SHARE)
+    monkeypatch.setattr(data_module, "HostPhotoTransfer", copies)
     photos = load(scene, tmp_path).photos
     assert isinstance(photos._copies, copies)
     assert sum(not isinstance(kept, Path) for kept in photos._held) == held
@@ -141,9 +142,9 @@ def test_photos_that_do_not_fit_are_brought_when_they_are_read(
 
 
 def test_what_is_held_for_a_gpu_are_the_codes_of_the_file(codes, tmp_path):
-    held = CudaCopies.hold(None, tmp_path, codes[0].numpy())
+    held = CudaPhotoTransfer.hold(None, tmp_path, codes[0].numpy())
     assert held.dtype == torch.uint8 and torch.equal(held, codes[0])
-    deep = CudaCopies.hold(None, tmp_path, np.full((2, 2, 3), 65535, np.uint16))
+    deep = CudaPhotoTransfer.hold(None, tmp_path, np.full((2, 2, 3), 65535, np.uint16))
     assert torch.equal(deep, torch.ones(2, 2, 3))
 
 
@@ -158,9 +159,9 @@ def test_a_photo_that_has_gone_is_named_when_it_is_read(scene, tmp_path, monkeyp
 
 def test_a_share_of_the_memory_decides(monkeypatch):
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 8000))
-    assert room(torch.device("cuda")) == 250
+    assert photo_memory(torch.device("cuda")) == 250
     monkeypatch.setattr(os, "sysconf", {"SC_PAGE_SIZE": 10, "SC_PHYS_PAGES": 100}.__getitem__)
-    assert (room(CPU), room(CPU, RESIDENT)) == (50, 250)
+    assert (photo_memory(CPU), photo_memory(CPU, RESIDENT_SHARE)) == (50, 250)
 
 
 def test_keep_maps_take_a_byte_a_pixel_and_are_read_as_float32():
@@ -174,7 +175,7 @@ def test_keep_maps_take_a_byte_a_pixel_and_are_read_as_float32():
 
 def test_smaller_photos_are_kept_at_the_present_size_alone(scene, tmp_path):
     data = load(scene, tmp_path)
-    pyramid = Pyramid(data)
+    pyramid = PhotoPyramid(data)
     quarter = pyramid.photo(0, 4)
     assert pyramid.photo(0, 4) is quarter and quarter.shape == (12, 16, 3)
     assert torch.equal(pyramid.photo(1, 2), shrink(data.photos[1], 2)) and list(pyramid._photos) == [1]

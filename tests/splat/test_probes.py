@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ambiguous_wild.splat.method_hooks import Schedule
-from ambiguous_wild.splat.pace import Pace
+from ambiguous_wild.splat.run_schedule import RunSchedule
 from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import advance, train
@@ -33,7 +33,7 @@ class Empty(Trainer):
         self.config, self.folder, self.iteration = config, folder, 0
         self.probe = lambda draw: 20.0 + self.iteration
         self.timeline = Timeline()
-        self.pace = Pace(config, Schedule(), data, start=5, most=5)  # type: ignore[arg-type]
+        self.run_schedule = RunSchedule(config, Schedule(), data, start=5, most=5)  # type: ignore[arg-type]
         self.clock = Steady(self)
 
     def step(self) -> float:

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.splat import gsplat_seam, readiness
-from ambiguous_wild.splat.readiness import GpuFacts, choose, why_not
+from ambiguous_wild.splat import gsplat_calls, readiness
+from ambiguous_wild.splat.readiness import GpuFacts, choose_device, missing_dependency
 
 TORCH = {
     "version": "2.13.0",
@@ -49,14 +49,16 @@ def kernels(monkeypatch):
             return 0.999
 
     monkeypatch.setenv("PATH", "/bin")  # what is added to it is taken back
-    monkeypatch.setattr(gsplat_seam, "max_alpha", state := Kernels())
+    monkeypatch.setattr(gsplat_calls, "max_alpha", state := Kernels())
     return state
 
 
 def test_a_machine_that_lacks_nothing_is_ready():
-    assert why_not(found()) is None
-    assert why_not(found({"toolkit": None}, compiler=None, prebuilt=True)) is None  # nothing to compile
-    assert why_not(found(gsplat="1.5.3+pt29cu130")) is None
+    assert missing_dependency(found()) is None
+    assert (
+        missing_dependency(found({"toolkit": None}, compiler=None, prebuilt=True)) is None
+    )  # nothing to compile
+    assert missing_dependency(found(gsplat="1.5.3+pt29cu130")) is None
 
 
 CASES = {
@@ -90,22 +92,22 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_each_lack_is_one_line_with_what_brings_it(case):
     machine, what, fix = CASES[case]
-    lack = why_not(machine)
+    lack = missing_dependency(machine)
     assert lack is not None and what in lack.what and fix in lack.fix
     assert "\n" not in str(lack) and str(lack) == f"{lack.what}: {lack.fix}"
     with pytest.raises(AwError) as error:
-        choose("cuda", print, looking=lambda: machine)
+        choose_device("cuda", print, collect_facts=lambda: machine)
     assert str(error.value).startswith(f"--device cuda: {lack}") and error.value.exit_code == 2
 
 
 def test_all_that_the_compiler_lacks_is_said_at_once():
-    lack = why_not(found({"toolkit": None}, compiler=None))
+    lack = missing_dependency(found({"toolkit": None}, compiler=None))
     assert "needs nvcc and a C++17 compiler to compile" in lack.what
     assert "toolkit" in lack.fix and "apt-get install g++" in lack.fix
 
 
 def test_the_command_replaces_a_cpu_build_by_the_same_release():
-    fix = why_not(found(CPU_BUILD)).fix
+    fix = missing_dependency(found(CPU_BUILD)).fix
     assert fix.endswith("'torch==2.13.0'") and "+cpu" not in fix
 
 
@@ -114,10 +116,10 @@ def test_the_command_replaces_a_cpu_build_by_the_same_release():
 
 def test_auto_takes_the_gpu_or_says_why_it_lies_idle(kernels):
     said = []
-    assert choose("auto", said.append, looking=found) == "cuda" and said == []
+    assert choose_device("auto", said.append, collect_facts=found) == "cuda" and said == []
     assert kernels.drawn == 1
     machine = found(gsplat=None)
-    assert choose("auto", said.append, looking=lambda: machine) == "cpu"
+    assert choose_device("auto", said.append, collect_facts=lambda: machine) == "cpu"
     (line,) = said
     assert line.startswith("warning: the GPU is not used, the CPU is: gsplat is not installed: ")
     assert "[cuda]" in line and "\n" not in line and kernels.drawn == 1
@@ -126,11 +128,11 @@ def test_auto_takes_the_gpu_or_says_why_it_lies_idle(kernels):
 def test_auto_says_nothing_where_there_is_no_gpu():
     said = []
     machine = found(CPU_BUILD, driver=None, gsplat=None)
-    assert choose("auto", said.append, looking=lambda: machine) == "cpu" and said == []
+    assert choose_device("auto", said.append, collect_facts=lambda: machine) == "cpu" and said == []
 
 
 def test_the_cpu_is_taken_without_a_look():
-    assert choose("cpu", print, looking=lambda: pytest.fail("looked")) == "cpu"
+    assert choose_device("cpu", print, collect_facts=lambda: pytest.fail("looked")) == "cpu"
 
 
 @pytest.mark.parametrize(
@@ -147,12 +149,12 @@ def test_the_cpu_is_taken_without_a_look():
 def test_kernels_that_cannot_be_made_are_one_line_with_the_command(kernels, fails, reason):
     kernels.fails = fails
     said = []
-    assert choose("auto", said.append, looking=found) == "cpu"
+    assert choose_device("auto", said.append, collect_facts=found) == "cpu"
     (line,) = said
     assert f"gsplat cannot draw on this GPU: {reason}" in line and "\n" not in line
     assert f"{readiness.INSTALL_GSPLAT} --force-reinstall --no-deps" in line
     with pytest.raises(AwError, match="cannot draw on this GPU"):
-        choose("cuda", said.append, looking=found)
+        choose_device("cuda", said.append, collect_facts=found)
 
 
 def test_ninja_of_this_environment_is_found_though_nobody_activated_it(kernels):
@@ -161,7 +163,7 @@ def test_ninja_of_this_environment_is_found_though_nobody_activated_it(kernels):
         assert os.environ["PATH"].split(":") == ["/bin", str(Path(sys.executable).parent)]
 
 
-# -- looking --------------------------------------------------------------------------------------
+# -- collect_facts --------------------------------------------------------------------------------------
 
 
 def program(folder, name, text):
@@ -182,8 +184,8 @@ def test_what_is_looked_at_is_what_torch_and_gsplat_will_take(tmp_path, monkeypa
     (tmp_path / "gsplat/__init__.py").touch()
     (tmp_path / "gsplat-1.5.3.dist-info/METADATA").write_text("Name: gsplat\nVersion: 1.5.3\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    seen = readiness.look(TORCH)
+    seen = readiness.gpu_facts(TORCH)
     assert (seen.driver, seen.gsplat, seen.hidden) == ("Fine GPU, 600.0", "1.5.3", None)
     assert seen.compiler == str(tmp_path / "bin/my-c++") and not seen.prebuilt
     (tmp_path / "gsplat/csrc.cpython-312-x86_64-linux-gnu.so").touch()
-    assert readiness.look(TORCH).prebuilt
+    assert readiness.gpu_facts(TORCH).prebuilt

@@ -1,4 +1,4 @@
-"""What methods may rely on: pulls are values, state travels with a Gaussian, statistics are asked for."""
+"""What methods may rely on: vjps are values, state travels with a Gaussian, statistics are asked for."""
 
 from dataclasses import replace
 
@@ -140,11 +140,11 @@ def test_a_learnt_row_learns(scene, tmp_path):
 def test_rows_are_checked():
     g = gaussians(0, n=4)
     with pytest.raises(AwError, match="under a name of its own"):
-        g.carrying({"means": torch.zeros(4, 3)})
+        g.with_attributes({"means": torch.zeros(4, 3)})
     with pytest.raises(AwError, match="must be \\[4"):
-        g.carrying({"more": torch.zeros(3, 3)})
+        g.with_attributes({"more": torch.zeros(3, 3)})
     with pytest.raises(AwError, match=r"only one side has the attributes .*more"):
-        g.carrying({"more": torch.zeros(4)}).cat(g)
+        g.with_attributes({"more": torch.zeros(4)}).cat(g)
 
 
 # -- shading, blur, statistics ----------------------------------------------------------------------
@@ -255,7 +255,7 @@ def test_a_start_of_ones_own(scene, tmp_path):
 
 
 def test_other_gaussians_may_be_drawn_under_the_smoothing_filter(scene, tmp_path):
-    parts = MethodHooks(effects=(SmoothingFilter(),)).suited_to(SmoothingFilter())
+    parts = MethodHooks(effects=(SmoothingFilter(),)).with_effect(SmoothingFilter())
     trainer = trainer_for(scene, tmp_path, parts=parts)
     while trainer.iteration < 5:
         trainer.step()

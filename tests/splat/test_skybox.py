@@ -13,7 +13,13 @@ from ambiguous_wild.methods.registry import get_method
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.effects.skybox import COUNT, MIN_SPHERE_POINTS, Skybox, fibonacci_sphere, sphere_of
+from ambiguous_wild.splat.effects.skybox import (
+    COUNT,
+    MIN_SPHERE_POINTS,
+    Skybox,
+    fibonacci_sphere,
+    skybox_sphere,
+)
 from ambiguous_wild.splat.gaussians import PARAMETERS
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.rendered import Gradients
@@ -49,7 +55,7 @@ def shares(camera, xyz):
 
 def test_it_lies_far_behind_cameras_and_points_where_photos_look(data):
     xyz, rgb = Skybox().first_points(data, MANY)
-    middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
+    middle, radius = skybox_sphere(data.cameras, data.scene.points.xyz)
     assert xyz.shape == rgb.shape and rgb.dtype == np.uint8 and 0 < len(xyz) < COUNT
     np.testing.assert_allclose(np.linalg.norm(xyz - middle, axis=1), radius)
     for camera in data.cameras:
@@ -90,7 +96,7 @@ def test_what_the_capture_masks_is_no_background(data):
 
 def test_with_little_room_it_is_coarser_and_still_all_around(data):
     whole, _ = Skybox().first_points(data, MANY)
-    _, radius = sphere_of(data.cameras, data.scene.points.xyz)
+    _, radius = skybox_sphere(data.cameras, data.scene.points.xyz)
     effect = Skybox()
     half, _ = effect.first_points(data, len(whole) - 1)
     assert effect.facts() == {"points": len(half)} and 0.3 * len(whole) < len(half) < len(whole)
@@ -202,7 +208,7 @@ def test_every_kind_of_density_control_leaves_it_alone(data, tmp_path, name):
 
 
 def test_without_points_the_cameras_say_where_the_sphere_is(data):
-    middle, radius = sphere_of(data.cameras, np.zeros((0, 3)))
+    middle, radius = skybox_sphere(data.cameras, np.zeros((0, 3)))
     centres = np.array([camera.center for camera in data.cameras])
     np.testing.assert_allclose(middle, np.median(centres, axis=0))
     assert radius > np.linalg.norm(centres - middle, axis=1).max() > 0

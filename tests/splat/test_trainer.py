@@ -23,8 +23,14 @@ from ambiguous_wild.splat.cpu import set_threads
 from ambiguous_wild.splat.data import shrink, shrink_keep
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks, Schedule
-from ambiguous_wild.splat.pace import Level, Pace, ceiling_at, coarse_to_fine, factor_at
 from ambiguous_wild.splat.rendered import Cotangents
+from ambiguous_wild.splat.run_schedule import (
+    ResolutionLevel,
+    RunSchedule,
+    coarse_to_fine,
+    downsampling_at,
+    growth_cap_at,
+)
 from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.training_loop import train
 from tests.splat.scenes import bits, same, trained, trainer_for
@@ -309,7 +315,7 @@ def test_a_budget_scales_the_schedule_and_is_kept(scene, tmp_path, fake_time):
 
 def test_every_view_once_an_epoch(scene, tmp_path):
     trainer = trainer_for(scene, tmp_path)
-    order = [trainer.pace.view(i) for i in range(1, 13)]
+    order = [trainer.run_schedule.view(i) for i in range(1, 13)]
     assert sorted(order[:6]) == sorted(order[6:]) == list(range(6))
 
 
@@ -321,20 +327,22 @@ def test_coarse_to_fine_follows_the_photos_spectrum():
     assert [level.factor for level in rough_levels] == [4, 2, 1]
     assert all(0 <= a.begin < b.begin <= 0.4 for a, b in pairwise(rough_levels))
     assert [level.factor for level in smooth_levels] == [4, 2, 1]
-    assert coarse_to_fine([np.full((400, 400, 3), 0.5)]) == (Level(0.0, 1),)
-    assert coarse_to_fine([noise[:80, :80]]) == (Level(0.0, 1),)
-    assert [factor_at(rough_levels, p) for p in (0.0, 0.5, 1.0)] == [4, 1, 1]
+    assert coarse_to_fine([np.full((400, 400, 3), 0.5)]) == (ResolutionLevel(0.0, 1),)
+    assert coarse_to_fine([noise[:80, :80]]) == (ResolutionLevel(0.0, 1),)
+    assert [downsampling_at(rough_levels, p) for p in (0.0, 0.5, 1.0)] == [4, 1, 1]
 
 
 def test_the_number_of_gaussians_needs_no_photo():
     """A photo that does not fit into memory is read from its file."""
     camera, scene = SimpleNamespace(height=8, width=9), SimpleNamespace(extent=1.0)
     data = SimpleNamespace(scene=scene, photos=[None], cameras=[camera])
-    assert Pace(TrainConfig(iterations=100), Schedule(), data, start=5, most=100).most == 72
+    assert RunSchedule(TrainConfig(iterations=100), Schedule(), data, start=5, most=100).max_gaussians == 72
 
 
 def test_the_count_ceiling_rises_with_the_resolution():
-    values = [ceiling_at(1000, 50_000, d, p) for d, p in ((4, 0.0), (4, 0.2), (2, 0.2), (2, 0.4), (1, 0.4))]
+    values = [
+        growth_cap_at(1000, 50_000, d, p) for d, p in ((4, 0.0), (4, 0.2), (2, 0.2), (2, 0.4), (1, 0.4))
+    ]
     assert values == sorted(values)
     assert values[0] == 1000 + 49_000 // 16
     assert values[-1] == 50_000
@@ -342,9 +350,9 @@ def test_the_count_ceiling_rises_with_the_resolution():
 
 def test_a_short_run_grows_no_more_than_a_gaussian_a_pixel(scene, tmp_path):
     pixels = 64 * 48
-    assert trainer_for(scene, tmp_path, iterations=100).pace.most == pixels
-    assert trainer_for(scene, tmp_path, iterations=30_000).pace.most == 1_000_000
-    assert trainer_for(scene, tmp_path, iterations=100, max_gaussians=500).pace.most == 500
+    assert trainer_for(scene, tmp_path, iterations=100).run_schedule.max_gaussians == pixels
+    assert trainer_for(scene, tmp_path, iterations=30_000).run_schedule.max_gaussians == 1_000_000
+    assert trainer_for(scene, tmp_path, iterations=100, max_gaussians=500).run_schedule.max_gaussians == 500
 
 
 def test_more_points_than_a_run_may_hold_are_thinned_evenly(scene, tmp_path):

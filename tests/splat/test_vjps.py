@@ -201,7 +201,7 @@ def test_the_filter_is_that_of_the_cpu(fake, blur):
 @pytest.mark.parametrize("degree", [0, 2])
 def test_shaded_colours_and_their_gradients_are_those_of_the_cpu(fake, degree):
     g, cam = gaussians(3), camera()
-    g = g.carrying({"tint": torch.randn(len(g), 3, generator=torch.Generator().manual_seed(0))})
+    g = g.with_attributes({"tint": torch.randn(len(g), 3, generator=torch.Generator().manual_seed(0))})
     shade = shade_of(g, torch.tensor([0.9, 1.0, 0.7]))
     options = OPTIONS | {"sh_degree": degree, "shade": shade}
     there, cpu = (draw(g, cam, **options) for draw in (render_cuda, render_cpu))
@@ -226,7 +226,7 @@ def test_a_net_sees_nothing_of_rows_that_gsplat_leaves_out(fake, monkeypatch):
 
     monkeypatch.setattr(gsplat, "spherical_harmonics", leaves_out)
     g, cam = gaussians(3), camera()
-    g = g.carrying({"tint": torch.zeros(len(g), 3)})
+    g = g.with_attributes({"tint": torch.zeros(len(g), 3)})
     rendered = render_cuda(g, cam, **OPTIONS, shade=shade_of(g, torch.ones(3)))
     assert not rendered.visible.all()
     for name, value in tensors(rendered.backward(torch.ones_like(rendered.image))).items():

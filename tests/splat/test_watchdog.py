@@ -9,7 +9,7 @@ import torch
 
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.splat import checkpoint
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt
+from ambiguous_wild.splat.effects.autograd_effect import AutogradEffect, Leaf
 from ambiguous_wild.splat.method_hooks import MaskPolicy, MethodHooks
 from ambiguous_wild.splat.rendered import Gradients
 from ambiguous_wild.splat.train_config import TrainConfig
@@ -39,7 +39,7 @@ def poisoned(scene, folder, poison, **config):
 
 def test_a_gradient_is_named_and_kept_for_replay(scene, tmp_path):
     trainer = poisoned(scene, tmp_path / "run", Poison([17]))
-    view = scene.train[trainer.pace.view(17)].name
+    view = scene.train[trainer.run_schedule.view(17)].name
     with pytest.raises(
         NonFinite, match=rf"gradient of .*means.* iteration 17, view {view}.*--replay"
     ) as info:
@@ -56,10 +56,10 @@ def test_a_gradient_is_named_and_kept_for_replay(scene, tmp_path):
     seen = checkpoint.load(where / STEP)
     rows = ~torch.isfinite(seen["d_means"]).all(1)
     assert rows.nonzero()[:10, 0].tolist() == list(finding.rows)
-    assert torch.equal(seen["photo"], trainer.data.photos[trainer.pace.view(17)])
+    assert torch.equal(seen["photo"], trainer.data.photos[trainer.run_schedule.view(17)])
 
 
-class NoSlope(Learnt):
+class NoSlope(AutogradEffect):
     """At iteration 17 the gradient of `gain` alone is not finite: a root has no slope at 0."""
 
     name = "no-slope"
@@ -127,7 +127,7 @@ def test_a_rollback_goes_on_as_if_the_photo_had_been_left_out(scene, tmp_path):
     )
     train(trainer)
     other = poisoned(scene, tmp_path / "b", Poison())
-    left_out = {(other.pace.epoch(i), other.pace.view(i)) for i in (17, 40)}
+    left_out = {(other.run_schedule.epoch(i), other.run_schedule.view(i)) for i in (17, 40)}
     other.watchdog.skips = lambda epoch, view: (epoch, view) in left_out
     train(other)
     assert bits(trainer) == bits(other)

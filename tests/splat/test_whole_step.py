@@ -9,7 +9,7 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.methods import get_method
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
-from ambiguous_wild.splat.pace import Level
+from ambiguous_wild.splat.run_schedule import ResolutionLevel
 from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from tests.host_reads import READ, moved, no_transfers
@@ -68,7 +68,7 @@ def late(scene, folder, method, effects=(), at=0.5, divisor=1, **options) -> Tra
     parts = with_effects(entry.build(with_options(entry.options(), options)), effects)
     trainer = Trainer(data, parts, TrainConfig(iterations=100_000, probes=0), folder=folder / "run")
     trainer.iteration = int(at * 100_000) // PHOTOS * PHOTOS  # an epoch begins
-    trainer.pace.levels = (Level(0.0, divisor),)
+    trainer.run_schedule.levels = (ResolutionLevel(0.0, divisor),)
     trainer.watchdog.every = 10**9  # looking does read
     trainer.density.config = replace(trainer.density.config, start=1e9, stop=1e9, resets=(), min_every=10**9)
     return trainer

@@ -14,7 +14,14 @@ from hypothesis import strategies as st
 from ambiguous_wild.core import AwError, Camera
 from ambiguous_wild.methods.refinesplat.merging import covariances, merge_members, scale_rotation
 from ambiguous_wild.methods.refinesplat.recipe import consistency_loss
-from ambiguous_wild.methods.refinesplat.threshold import contrast, entropy, learnt, pool_of, surprise, t_ent
+from ambiguous_wild.methods.refinesplat.threshold import (
+    cross_entropy,
+    entropy,
+    instance_stats,
+    kl_divergence,
+    t_ent,
+    updated_theta,
+)
 from ambiguous_wild.metrics.image import psnr, ssim, ssim_inria
 from ambiguous_wild.metrics.stats import mean, mean_interval, paired_interval, sample_std
 from ambiguous_wild.splat.cpu.cpu_render import render_cpu
@@ -91,8 +98,8 @@ def test_entropy_lies_in_0_to_1_with_a_finite_gradient(rows, variant):
     (gradient,) = torch.autograd.grad(h.sum(), logits)
     assert torch.isfinite(gradient).all()
     other = logits.detach().flip(0)
-    assert torch.isfinite(surprise(logits.detach(), other, variant)).all()
-    assert (contrast(logits.detach(), other, variant) >= 0).all()
+    assert torch.isfinite(cross_entropy(logits.detach(), other, variant)).all()
+    assert (kl_divergence(logits.detach(), other, variant) >= 0).all()
 
 
 @FEW
@@ -104,11 +111,11 @@ def test_entropy_lies_in_0_to_1_with_a_finite_gradient(rows, variant):
 )
 def test_a_threshold_is_a_number_and_w2_lies_in_0_to_1(values, w2, form, gate):
     x = np.array(values)
-    pool, x = pool_of(torch.from_numpy(x)), torch.from_numpy(x)
+    pool, x = instance_stats(torch.from_numpy(x)), torch.from_numpy(x)
     assert not math.isnan(t_ent(pool, w2, form, gate).threshold)
     theta = torch.zeros((), dtype=torch.float64)
     for _ in range(3):
-        theta = learnt(theta, pool, x.flip(0), torch.ones_like(x), torch.zeros_like(theta))
+        theta = updated_theta(theta, pool, x.flip(0), torch.ones_like(x), torch.zeros_like(theta))
     assert 0 < torch.sigmoid(theta) < 1
 
 

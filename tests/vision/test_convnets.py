@@ -125,7 +125,7 @@ PUBLISHED = {
 @pytest.mark.usefixtures("machine_weights")
 @pytest.mark.parametrize("layer", PUBLISHED)
 def test_the_published_network_gives_the_values_of_the_reference_package(layer: str) -> None:
-    if weight_registry.where(weight_registry.named("efficientnet-lite0")) is None:
+    if weight_registry.weight_path(weight_registry.get_weight("efficientnet-lite0")) is None:
         pytest.skip(f"weights missing; run: {weight_registry.get_command('efficientnet-lite0')}")
     rows, columns = np.mgrid[0:64, 0:96].astype(np.float64)
     waves = [0.5 + 0.4 * np.sin(rows / 5 + k) * np.cos(columns / (7 + k)) for k in range(3)]
@@ -142,7 +142,7 @@ def test_the_published_network_gives_the_values_of_the_reference_package(layer: 
 def test_files_of_another_network_are_named(tmp_path: Path, name: str, damage: str, photo) -> None:
     tensors = vgg_tensors() if name == "vgg16" else efficientnet_tensors()
     key = next(k for k in tensors if k.endswith("weight") and tensors[k].ndim == 4)
-    path = tmp_path / weight_registry.named(name).files[0]
+    path = tmp_path / weight_registry.get_weight(name).files[0]
     if damage == "missing":
         del tensors[key]
     elif damage == "shape":
@@ -168,7 +168,7 @@ def test_files_of_another_network_are_named(tmp_path: Path, name: str, damage: s
 def test_the_registered_place_holds_the_published_network_and_a_folder_any(
     nets: Path, own: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    weight = weight_registry.named(name)
+    weight = weight_registry.get_weight(name)
     path = own / name / weight.files[0]
     path.parent.mkdir(parents=True)
     shutil.copy(nets / path.name, path)
@@ -176,7 +176,7 @@ def test_the_registered_place_holds_the_published_network_and_a_folder_any(
         _ = ConvFeatures(name).model
     assert ConvFeatures(name, None, path.parent).model is not None
     published = dataclasses.replace(weight, tensors=tensors_digest(read_as_arrays(path)))
-    monkeypatch.setattr(weight_registry, "named", lambda _: published)
+    monkeypatch.setattr(weight_registry, "get_weight", lambda _: published)
     assert ConvFeatures(name).model is not None
 
 

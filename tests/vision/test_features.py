@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from ambiguous_wild.core import AwError
-from ambiguous_wild.vision.protocols import blurred_noisy_copy, spaced
+from ambiguous_wild.vision.protocols import blurred_noisy_copy, evenly_spaced_indices
 
 IN_FLOAT64 = ("labhog", "sceneconv", "dinov2", "registers", "dinov1")
 each = pytest.mark.parametrize("kind", (*IN_FLOAT64, "vgg16", "efficientnet-lite0"))
@@ -28,7 +28,7 @@ def test_the_unit_is_the_distance_that_blur_and_noise_make_and_state_goes_round(
 
 
 def test_photos_to_fit_are_spread_evenly():
-    assert spaced(5, 2) == [0, 4] and spaced(3, 8) == [0, 1, 2]
+    assert evenly_spaced_indices(5, 2) == [0, 4] and evenly_spaced_indices(3, 8) == [0, 1, 2]
 
 
 @each

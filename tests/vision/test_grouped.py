@@ -12,7 +12,7 @@ from ambiguous_wild.vision.segments import (
     GroupConfig,
     GroupedSegments,
     SegmentConfig,
-    group,
+    merge_segments,
     neighbours,
     segment_features,
 )
@@ -41,16 +41,16 @@ def test_features_of_a_segment_are_the_mean_over_its_cells() -> None:
 def test_similar_neighbours_merge_first_and_the_rest_stays() -> None:
     directions = np.array([[1, 0], [1, 0.05], [0, 1], [0.05, 1], [-1, 0], [-1, 0.3]], float)
     labels = stripes(6)
-    merged = group(labels, directions, GroupConfig(alike=0.6, fewest=1))
+    merged = merge_segments(labels, directions, GroupConfig(alike=0.6, fewest=1))
     assert merged[0, ::8].tolist() == [1, 1, 2, 2, 3, 3]
-    assert group(labels, directions, GroupConfig(alike=0.6, fewest=4)).max() == 4
-    assert np.array_equal(group(labels, directions, GroupConfig(alike=0.6, fewest=9)), labels)
-    assert group(labels, directions, GroupConfig(alike=1.0, fewest=2)).max() == 2
+    assert merge_segments(labels, directions, GroupConfig(alike=0.6, fewest=4)).max() == 4
+    assert np.array_equal(merge_segments(labels, directions, GroupConfig(alike=0.6, fewest=9)), labels)
+    assert merge_segments(labels, directions, GroupConfig(alike=1.0, fewest=2)).max() == 2
 
 
 def test_like_segments_that_do_not_touch_stay_apart() -> None:
     features = np.array([[1.0, 0], [0, 1], [1, 0], [1, 0.1]])
-    merged = group(stripes(4), features, GroupConfig(alike=0.3, fewest=1))
+    merged = merge_segments(stripes(4), features, GroupConfig(alike=0.3, fewest=1))
     assert merged[0, ::8].tolist() == [1, 2, 3, 3]
 
 
@@ -58,12 +58,12 @@ def test_a_group_is_compared_by_all_of_its_pixels() -> None:
     """A large segment outweighs a small one that it has swallowed."""
     labels = np.repeat([1, 2, 3], [40, 2, 20])[None].repeat(4, 0).astype(np.int32)
     features = np.array([[1.0, 0.0], [0.97, 0.243], [0.0, 1.0]])
-    merged = group(labels, features, GroupConfig(alike=0.5, fewest=1))
+    merged = merge_segments(labels, features, GroupConfig(alike=0.5, fewest=1))
     assert merged[0, 0] == merged[0, 41] != merged[0, -1]
 
 
 def test_one_segment_is_one_group() -> None:
-    assert group(np.ones((5, 6), np.int32), np.ones((1, 3)), GroupConfig()).max() == 1
+    assert merge_segments(np.ones((5, 6), np.int32), np.ones((1, 3)), GroupConfig()).max() == 1
 
 
 class Colours:

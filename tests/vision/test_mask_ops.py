@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ambiguous_wild.vision.mask_ops import add_new, box_nms, mask_boxes, paint
+from ambiguous_wild.vision.mask_ops import add_untracked, box_nms, mask_boxes, paint
 
 
 def random_masks(seed: int) -> np.ndarray:
@@ -73,9 +73,9 @@ def test_what_is_followed_is_not_found_again():
     found[:, :5] = 1  # four fifths under 7: known
     found[:, 5:7] = 2  # new, small
     found[:, 7:] = 3  # new, larger: first
-    labels, free = add_new(tracked, found, 20, most=10)
+    labels, free = add_untracked(tracked, found, 20, most=10)
     assert free == 22
     assert [int(x) for x in labels[0]] == [7, 7, 7, 7, 0, 21, 21, 20, 20, 20]
-    labels, free = add_new(tracked, found, 20, most=2)
+    labels, free = add_untracked(tracked, found, 20, most=2)
     assert free == 21 and sorted(np.unique(labels)) == [0, 7, 20]
-    assert add_new(tracked, found, 20, most=1)[1] == 20
+    assert add_untracked(tracked, found, 20, most=1)[1] == 20

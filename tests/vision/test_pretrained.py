@@ -95,7 +95,7 @@ def test_every_name_a_user_can_write_is_a_known_weight():
     from ambiguous_wild.vision import backends
 
     for name in (*backends.DINO.values(), *backends.SAM.values(), *backends.SAM_VIDEO.values()):
-        assert weight_registry.named(name).kind == "hub"
+        assert weight_registry.get_weight(name).kind == "hub"
 
 
 def test_without_transformers_the_message_is_the_command(checkpoint, monkeypatch):

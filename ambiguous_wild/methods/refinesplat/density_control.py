@@ -18,7 +18,7 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import State, check_limits
 from ambiguous_wild.core.errors import unknown
-from ambiguous_wild.methods.refinesplat.merging import MergeConfig, merged
+from ambiguous_wild.methods.refinesplat.merging import MergeConfig, merge_gaussians
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.density import (
     NO_SIZE_PRUNING,
@@ -55,10 +55,10 @@ class Support:
         self.kept = torch.zeros(0)  # [N]
 
     def due(self, iteration: int) -> bool:
-        """Whether this iteration is a look."""
+        """Whether a view is observed in this iteration."""
         return self.config.least_share > 0 and iteration % self.config.every == 0
 
-    def look(self, gaussians: Gaussians, visible: Tensor, camera: Camera, keep: Tensor | None) -> None:
+    def observe(self, gaussians: Gaussians, visible: Tensor, camera: Camera, keep: Tensor | None) -> None:
         """Add one view.
 
         Args:
@@ -80,7 +80,7 @@ class Support:
         self.looked[rows] += inside.to(self.looked.dtype)
         self.kept[rows] += (inside & supported).to(self.kept.dtype)
 
-    def judge(self) -> Tensor:
+    def unsupported(self) -> Tensor:
         """Return the Gaussians to remove, [N] bool; the counts of judged ones that stay are halved."""
         judged = self.looked >= self.config.looks
         drop = judged & (self.kept < self.config.least_share * self.looked)
@@ -197,7 +197,7 @@ class EntropyAwareDensity(DensityControl):
                 self.downhill -= gradients.means
             if self.support.due(step.iteration):
                 self.support.match(len(step.gaussians), step.gaussians.device)
-                self.support.look(step.gaussians, step.rendered.visible, step.camera, keep)
+                self.support.observe(step.gaussians, step.rendered.visible, step.camera, keep)
 
     @torch.no_grad()
     def refine(self, step: Step, gaussians: Gaussians, optimiser: SplatAdam) -> tuple[Gaussians, list[str]]:
@@ -207,7 +207,7 @@ class EntropyAwareDensity(DensityControl):
             return gaussians, events  # rows change at most once in an iteration
         self.last_judged = step.iteration
         self._match(gaussians)
-        drop = self.mutable_rows(self.support.judge(), gaussians)
+        drop = self.mutable_rows(self.support.unsupported(), gaussians)
         if not bool(drop.any()) or self.leaves_only_protected(drop, gaussians):
             return gaussians, events
         optimiser.flush()
@@ -244,7 +244,7 @@ class EntropyAwareDensity(DensityControl):
         self.last_merge = step.nominal
         # rows that no view has seen since the last round, above all new copies, have no statistic
         candidates = (self.views_seen > 0) & (self.mean_gradient() < config.merge_grad)
-        result = merged(gaussians, candidates, config.merge)
+        result = merge_gaussians(gaussians, candidates, config.merge)
         if result is None:
             return gaussians
         rows, new = result

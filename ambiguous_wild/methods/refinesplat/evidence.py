@@ -13,15 +13,15 @@ from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, Spread
 from ambiguous_wild.methods.refinesplat.identity import Psi
 from ambiguous_wild.methods.refinesplat.maps import spread_of
-from ambiguous_wild.methods.refinesplat.structure import box
-from ambiguous_wild.methods.refinesplat.threshold import Statistic, contrast, entropy, surprise
+from ambiguous_wild.methods.refinesplat.structure import box_filter
+from ambiguous_wild.methods.refinesplat.threshold import Statistic, cross_entropy, entropy, kl_divergence
 
 _EPS_SHARE = 0.1
 _COS_FLOOR = -1.0 + 1e-3  # U stays below 2000
 
 
 @dataclass(frozen=True)
-class Maps:
+class ComparisonMaps:
     """Maps of one photo compared with one render: on the feature grid [h, w], or on pixels [H, W]."""
 
     statistic: Tensor  # the judged statistic, in its unit
@@ -31,7 +31,9 @@ class Maps:
 
 
 @torch.no_grad()
-def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float, config: MaskConfig) -> Maps:
+def compare(
+    phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float, config: MaskConfig
+) -> ComparisonMaps:
     """Compute entropy, statistic and distance maps in float64 of features [h, w, C] of photo and render.
 
     Without psi (no instance has an identity) the entropy is 0 and the distance alone is judged.
@@ -41,7 +43,7 @@ def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float,
     cosine = torch.where(norms > 0, (phi_photo * phi_render).sum(2) / norms.clamp(min=1e-12), 1.0)
     distance = (1.0 - cosine).clamp(min=0.0) / unit
     if psi is None:
-        return Maps(
+        return ComparisonMaps(
             distance.double(), distance.double(), torch.zeros_like(distance).double(), cosine.double()
         )
     render = psi(phi_render)
@@ -49,28 +51,28 @@ def compare(phi_photo: Tensor, phi_render: Tensor, psi: Psi | None, unit: float,
     if config.statistic == "entropy":
         statistic = h
     elif config.statistic == "surprise":
-        statistic = surprise(render, psi(phi_photo), config.variant)
+        statistic = cross_entropy(render, psi(phi_photo), config.variant)
     elif config.statistic == "contrast":
-        statistic = contrast(render, psi(phi_photo), config.variant)
+        statistic = kl_divergence(render, psi(phi_photo), config.variant)
     elif config.statistic in ("evidence", "structure"):
-        statistic = torch.sqrt(contrast(render, psi(phi_photo), config.variant) * distance)
+        statistic = torch.sqrt(kl_divergence(render, psi(phi_photo), config.variant) * distance)
     else:
         raise unknown("statistic", config.statistic, get_args(Statistic))
-    return Maps(statistic.double(), distance.double(), h.double(), cosine.double())
+    return ComparisonMaps(statistic.double(), distance.double(), h.double(), cosine.double())
 
 
-def mask_unlearnt(maps: Maps, unseen: Tensor) -> Maps:
+def mask_unlearnt(maps: ComparisonMaps, unseen: Tensor) -> ComparisonMaps:
     """Remove the evidence where the model is not learnt yet (bool [h, w]).
 
     A sky without points differs from every photo until it is learnt, and if masked it never would be.
     """
     cosine = None if maps.cosine is None else maps.cosine.masked_fill(unseen, 1.0)
-    return Maps(
+    return ComparisonMaps(
         maps.statistic.masked_fill(unseen, 0.0), maps.distance.masked_fill(unseen, 0.0), maps.entropy, cosine
     )
 
 
-def scaled_by(structure: Tensor, evidence: Tensor, weight: float) -> Tensor:
+def scale_by_identities(structure: Tensor, evidence: Tensor, weight: float) -> Tensor:
     """Raise pixel evidence [H, W] where identities disagree, and lower it where they agree.
 
     The factor 1 + weight (2 g - 1), g = evidence / (evidence + 4), lies in [1 - weight, 1 + weight], so that
@@ -126,7 +128,7 @@ def global_mask(
     """
     if spread not in get_args(Spread):
         raise unknown("spread", spread, get_args(Spread))
-    smooth = box(r[None], size)[0]
+    smooth = box_filter(r[None], size)[0]
     middle, deviation = spread_of(smooth.flatten())
     floor = middle + gate * deviation
     if spread == "robust":
@@ -138,7 +140,7 @@ def global_mask(
     return smooth > (torch.maximum(threshold, floor) if gate > 0 else threshold)
 
 
-def global_of(maps: Maps, config: MaskConfig) -> Tensor:
+def global_mask_from_maps(maps: ComparisonMaps, config: MaskConfig) -> Tensor:
     """Return M_global on the feature grid, [h, w] bool: the ratio of U and H above its threshold (Eq. 6)."""
     assert maps.cosine is not None and maps.entropy is not None  # `compare` fills them
     cosine = maps.cosine

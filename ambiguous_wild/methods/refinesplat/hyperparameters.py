@@ -10,7 +10,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.methods.refinesplat.density_control import EntropyDensityConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
-from ambiguous_wild.methods.refinesplat.mask_prior import FirstLookConfig
+from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPriorConfig
 from ambiguous_wild.methods.refinesplat.multiview import MultiViewConfig
 from ambiguous_wild.methods.refinesplat.threshold import Form, Statistic, Variant
 from ambiguous_wild.vision.backends import check_features, check_instances
@@ -47,7 +47,7 @@ class MaskConfig:
     disagree: float = 3.0  # features only: `gate` for the distance of photo and render; 0 = printed
     # features only: least distance of photo and render in units of what blur and noise cause; 0 = printed
     disagree_units: float = 3.0
-    # no threshold above this share of the residual of unrelated pictures (`unrelated_residual`); 0 = printed
+    # no threshold above this share of `unrelated_pair_residual`; 0 = printed
     ceiling: float = 0.25  # `structure` only
     ceiling_least: float = 6.0  # `structure` only: least value of the ceiling, in units
     use_local: bool = True  # M_local; off is an ablation row
@@ -109,7 +109,9 @@ class RefineSplatConfig:
     """Times in nominal iterations (of 30 000); the `min_` fields are real iterations of the run."""
 
     mask: MaskConfig = field(default_factory=MaskConfig)
-    first_look: FirstLookConfig = field(default_factory=FirstLookConfig)  # keep maps until masks begin
+    first_look: InitialMaskPriorConfig = field(
+        default_factory=InitialMaskPriorConfig
+    )  # keep maps until masks begin
     features: str = "labhog"  # back end of phi, see docs/foundation-models.md; `dinov2-small` is the paper's
     instances: str = "graph"  # back end of the instance masks; `grounded-video:...` is the paper's
     segments: SegmentConfig = field(default_factory=SegmentConfig)  # settings of `graph`
@@ -117,7 +119,7 @@ class RefineSplatConfig:
     untracked: Literal["drop", "add"] = "drop"
     psi: PsiConfig = field(default_factory=PsiConfig)  # the frozen identity classifier
     density: EntropyDensityConfig = field(default_factory=EntropyDensityConfig)  # growth and merging
-    mask_start: float = 500.0  # warm-up: until then the first look alone decides which pixels are kept
+    mask_start: float = 500.0  # warm-up: until then the prior alone decides which pixels are kept
     min_mask_start: int = 250  # earlier renders show too little
     reset_pause: float = 300.0  # time after an opacity reset in which masks are not refreshed
     min_reset_pause: int = 200

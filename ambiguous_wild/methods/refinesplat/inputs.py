@@ -19,10 +19,10 @@ from ambiguous_wild.methods.refinesplat.identity import (
     psi_from_arrays,
     train_psi,
 )
-from ambiguous_wild.methods.refinesplat.masks import instance_means, smallest_type
+from ambiguous_wild.methods.refinesplat.masks import instance_means, label_dtype
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.step import TrainData
-from ambiguous_wild.vision.mask_ops import add_new
+from ambiguous_wild.vision.mask_ops import add_untracked
 from ambiguous_wild.vision.precompute import cache_key, cached, instance_labels, photo_features
 from ambiguous_wild.vision.protocols import Features, Instances
 from ambiguous_wild.vision.sceneconv import SceneConv
@@ -62,10 +62,12 @@ class FrozenInputs:
         single: Instances | None = getattr(instances, "single", None)  # a tracker's back end for one photo
         if segmented.scene_wide and single is not None and config.untracked == "add":
             everything = instance_labels(single, data.photos, names, data.cache_dir).labels
-            self._added = [untracked(label, all_found) for label, all_found in zip(self.labels, everything)]
+            self._added = [
+                untracked_instances(label, all_found) for label, all_found in zip(self.labels, everything)
+            ]
             self.labels = [np.maximum(label, added) for label, added in zip(self.labels, self._added)]
         self.counts = [max(int(label.max(initial=0)), 0) for label in self.labels]  # K of each photo
-        kind = smallest_type(max(self.counts, default=0))
+        kind = label_dtype(max(self.counts, default=0))
         self.labels = [np.maximum(label, 0).astype(kind) for label in self.labels]
         # [K] bool of each photo: instances that structure from motion shows to be static
         self.static = static_instances(
@@ -101,7 +103,7 @@ class FrozenInputs:
         config = self._config
         if not self._scene_wide:
             return self._associated(phi, self.labels, config.identities)
-        tracked = most_seen(self._ids, config.identities)
+        tracked = identities_by_photos(self._ids, config.identities)
         room = config.identities - tracked.count
         if not self._added or room <= 0:
             return _with_unknown(tracked, self.counts)
@@ -120,7 +122,7 @@ class FrozenInputs:
         )
 
 
-def untracked(tracked: np.ndarray, found: np.ndarray) -> np.ndarray:
+def untracked_instances(tracked: np.ndarray, found: np.ndarray) -> np.ndarray:
     """Return labels [H, W] int32, above the tracker's own, of the instances that a tracker leaves out.
 
     Trackers follow only the largest instances (`SamVideoConfig.most`).
@@ -132,7 +134,7 @@ def untracked(tracked: np.ndarray, found: np.ndarray) -> np.ndarray:
     # the largest first; an instance is new unless the tracked ones cover half of it
     total = int(np.count_nonzero(np.bincount(np.maximum(found, 0).ravel())))
     most = len(np.unique(tracked[tracked > 0])) + total
-    both, _ = add_new(tracked, found, int(tracked.max(initial=0)) + 1, most)
+    both, _ = add_untracked(tracked, found, int(tracked.max(initial=0)) + 1, most)
     return np.where(tracked > 0, 0, both).astype(np.int32)
 
 
@@ -161,7 +163,7 @@ def _compact(label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(label > 0, np.searchsorted(ids, label) + 1, 0).astype(np.int32), ids
 
 
-def most_seen(ids: list[np.ndarray], most: int) -> Identities:
+def identities_by_photos(ids: list[np.ndarray], most: int) -> Identities:
     """Return identities 1..P from scene-wide ids of each photo; those in most photos are kept."""
     every = np.concatenate([np.zeros(0, np.int64), *ids])
     unique, photos = np.unique(every, return_counts=True)

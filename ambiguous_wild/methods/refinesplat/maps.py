@@ -19,7 +19,7 @@ FAR_MORE = 1.5  # ratio of agreeing pixels from which an offset is accepted
 WHITE = 255.0  # colours are from 0 to 255
 
 
-def sized(array: np.ndarray, device: torch.device | str) -> Tensor:
+def to_device(array: np.ndarray, device: torch.device | str) -> Tensor:
     """Copy an array to the device as float32."""
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(device)
 
@@ -80,7 +80,7 @@ class MapStack:
         self.shares: Tensor | None = None
         if len(set(self.sizes)) > 1:
             shares = np.array([[size[1] / w, size[0] / h] for size in self.sizes])
-            self.shares = sized(shares[:, None, None], device)
+            self.shares = to_device(shares[:, None, None], device)
 
     def put(self, view: int, plane: Tensor, channel: int = 0) -> None:
         """Set one channel [h, w] float32 of a view's map."""
@@ -103,21 +103,21 @@ class MapStack:
             return np.ones((len(self.sizes), 2), np.float32)
         return self.shares.cpu().numpy().reshape(-1, 2)
 
-    def select(self, views: Tensor, *others: MapStack) -> Selected:
+    def select(self, views: Tensor, *others: MapStack) -> SelectedMaps:
         """Copy the maps of views [n] int64, float32; channels of other stacks of the same sizes follow."""
         shares = None if self.shares is None else self.shares.index_select(0, views)
         maps = [stack.stack.index_select(0, views) for stack in (self, *others)]
         if not others:
-            return Selected(maps[0], shares)
+            return SelectedMaps(maps[0], shares)
         n, _, h, w = maps[0].shape
         joined = torch.empty((n, sum(m.shape[1] for m in maps), h, w), device=maps[0].device)
         for part, m in zip(joined.split([m.shape[1] for m in maps], 1), maps):
             part.copy_(m)
-        return Selected(joined, shares)
+        return SelectedMaps(joined, shares)
 
 
 @dataclass(frozen=True)
-class Selected:
+class SelectedMaps:
     """Maps of n views, to read at places [n, rows, columns, 2], x and y from -1 to 1 (`grid_sample`)."""
 
     maps: Tensor  # [n, channels, h, w]
@@ -180,7 +180,7 @@ def spread_of(values: Tensor) -> tuple[Tensor, Tensor]:
     return middle, torch.maximum(deviation, 0.05 * middle.abs()).clamp_(min=1e-12)
 
 
-class Ranks:
+class ViewQuantile:
     """Quantiles over n views of which any number may be missing."""
 
     def __init__(self, views: int, quantile: float, device: torch.device | str) -> None:
@@ -205,7 +205,7 @@ class Ranks:
         return below + self.share[present] * (above - below)
 
 
-def agree(difference: Tensor, same: Tensor, most: float, offset: Tensor) -> Tensor:
+def colours_agree(difference: Tensor, same: Tensor, most: float, offset: Tensor) -> Tensor:
     """Return where views show the same colour, [n, P] bool.
 
     Args:

@@ -13,7 +13,7 @@ from ambiguous_wild.io.files import atomic_path
 from ambiguous_wild.io.mask_reasons import MaskReasons, reasons_of
 from ambiguous_wild.io.motion_points import MotionPoints
 from ambiguous_wild.io.palette import GLOBAL, LOCAL, MASKED, NEUTRAL, faded, plot_colour, ramp, tint
-from ambiguous_wild.methods.refinesplat.evidence import Maps
+from ambiguous_wild.methods.refinesplat.evidence import ComparisonMaps
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
 from ambiguous_wild.methods.refinesplat.masks import MaskStore, PhotoMasks, enlarge
 from ambiguous_wild.splat.step import Step
@@ -62,7 +62,7 @@ def panels(
     }
 
 
-def reasons(store: MaskStore, view: int, maps: Maps, masks: PhotoMasks) -> MaskReasons:
+def reasons(store: MaskStore, view: int, maps: ComparisonMaps, masks: PhotoMasks) -> MaskReasons:
     """Return why the regions of a photo are masked or kept.
 
     A region is the part of an instance, or of what lies in none, for which the same decided; the value in its
@@ -123,7 +123,7 @@ def _is_fused(config: MaskConfig) -> bool:
     return config.combine == "fused" and config.use_local and config.use_global
 
 
-def _judged(store: MaskStore, view: int, maps: Maps, masks: PhotoMasks) -> Tensor:
+def _judged(store: MaskStore, view: int, maps: ComparisonMaps, masks: PhotoMasks) -> Tensor:
     """Return what is compared with the threshold at each pixel, [H, W]; see `make_masks`."""
     shape = store.labels.shapes[view]
     own = enlarge(maps.statistic, *shape)

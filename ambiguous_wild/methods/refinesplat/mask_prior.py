@@ -12,8 +12,8 @@ The first answer is noisy, and wrong where distractors stand in most photos: few
 a crowd. So the answer for every photo is smoothed along the edges of its colours (guided filter, He et al.,
 ECCV 2010), and computed again without the pixels of other photos that were masked (`rounds`).
 
-Later masks are made from renders, but the first look still scales their evidence (`FirstLookConfig.weight`),
-because it does not depend on what the model has learnt.
+Later masks are made from renders, but the prior still scales their evidence
+(`InitialMaskPriorConfig.weight`), because it does not depend on what the model has learnt.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import torch
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.io.images import ximgproc
-from ambiguous_wild.methods.refinesplat.maps import Ranks, common_offset
+from ambiguous_wild.methods.refinesplat.maps import ViewQuantile, common_offset
 from ambiguous_wild.methods.refinesplat.multiview import nearest_views
 from ambiguous_wild.vision.sparse_surface import BEHIND, PIXELS, in_map, world_points
 
@@ -41,7 +41,7 @@ _WINDOW = np.ones((3, 3), np.uint8)  # px of the map in which the colour may lie
 
 
 @dataclass(frozen=True)
-class FirstLookConfig:
+class InitialMaskPriorConfig:
     """Which views are compared, and the largest difference of colour."""
 
     on: bool = True  # masks before training, from photos and sparse points
@@ -67,7 +67,7 @@ class FirstLookConfig:
     weight: float = 1.5  # `structure`: largest factor or divisor of later evidence; 1 = unchanged
     # the weight in a crowd, because there the first renders show distractors
     crowd_weight: float = 6.0
-    # later masks cover at most this many times what the first look masks of the photo, the surest pixels;
+    # later masks cover at most this many times what the prior masks of the photo, the surest pixels;
     # otherwise a surface that few photos show is masked whole and never learnt. Skull, cut-outs 11, 13, 1500
     # iterations: 15.3, 15.6 dB, with it 18.2, 16.5; 0 = no such limit
     most: float = 2.5
@@ -91,7 +91,7 @@ class InitialMaskPrior:
     least: float  # if a smaller share of the photo would be masked, nothing is
     weight: float  # largest factor of later evidence
     most: float = 1.0  # largest share of the photo that later masks cover
-    # in a crowd later masks lie within those of the first look: the ground between people shows in few photos
+    # in a crowd later masks lie within those of the prior: the ground between people shows in few photos
     within: bool = False
     moves: np.ndarray | None = None  # bool, masked whatever later evidence says; None: nothing is
 
@@ -118,11 +118,11 @@ def initial_mask_prior(
     cameras: Sequence[Camera],
     photos: Iterable[np.ndarray],
     surfaces: Sequence[np.ndarray | None],
-    config: FirstLookConfig,
+    config: InitialMaskPriorConfig,
     moving: Sequence[np.ndarray | None] | None = None,
     certain: Sequence[np.ndarray | None] | None = None,
 ) -> list[InitialMaskPrior | None]:
-    """Return the first look at every photo; None for one without sparse points or comparable views.
+    """Return the prior of every photo; None for one without sparse points or comparable views.
 
     Args:
         cameras: cameras of the photos.
@@ -190,7 +190,7 @@ def initial_mask_prior(
     ]
 
 
-def _most(answer: np.ndarray, inverse: np.ndarray | None, config: FirstLookConfig) -> float:
+def _most(answer: np.ndarray, inverse: np.ndarray | None, config: InitialMaskPriorConfig) -> float:
     """Return the share of the photo that later masks may cover."""
     if config.most <= 0 or inverse is None or np.isfinite(inverse).mean() < _MIN_KNOWN:
         return 1.0
@@ -278,13 +278,13 @@ def _smoothed(answer: np.ndarray, photo: np.ndarray, smooth: float) -> np.ndarra
     return np.clip(ximgproc().guidedFilter(photo, answer, radius, _EDGE), 0.0, 1.0)
 
 
-def _judge(ours: np.ndarray, seen: list[_Seen], config: FirstLookConfig) -> np.ndarray | None:
+def _judge(ours: np.ndarray, seen: list[_Seen], config: InitialMaskPriorConfig) -> np.ndarray | None:
     """Return 1 = distractor, 0 = others show it too, 0.5 = unknown, [h, w] float32; None if all unknown."""
     if not seen:
         return None
     stack = np.stack([view.outside(ours) for view in seen])
     views = np.isfinite(stack).sum(axis=0)
-    ranks = Ranks(len(stack), config.quantile, "cpu")
+    ranks = ViewQuantile(len(stack), config.quantile, "cpu")
     evidence = ranks.quantile_of(torch.from_numpy(stack), torch.from_numpy(views)).numpy()
     known = views >= config.known_by
     if not known.any():

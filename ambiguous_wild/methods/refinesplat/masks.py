@@ -18,12 +18,22 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core.config import State
-from ambiguous_wild.methods.refinesplat.evidence import Maps, global_of, scaled_by
+from ambiguous_wild.methods.refinesplat.evidence import (
+    ComparisonMaps,
+    global_mask_from_maps,
+    scale_by_identities,
+)
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.maps import EnlargedMaps, spread_of
 from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPrior
-from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence, grown, hysteresis
-from ambiguous_wild.methods.refinesplat.threshold import InstanceStats, Threshold, learnt, pool_of, t_ent
+from ambiguous_wild.methods.refinesplat.pixels import PixelEvidence, final_mask, hysteresis
+from ambiguous_wild.methods.refinesplat.threshold import (
+    InstanceStats,
+    Threshold,
+    instance_stats,
+    t_ent,
+    updated_theta,
+)
 from ambiguous_wild.splat.backend import backend_of
 
 if TYPE_CHECKING:
@@ -51,7 +61,7 @@ class PhotoMasks:
 
 
 @dataclass(frozen=True)
-class Judged:
+class InstanceStatistics:
     """Statistics of a photo's instances when its mask was last made, for pictures."""
 
     values: np.ndarray  # [K] float64, mean statistic (Hbar)
@@ -86,7 +96,7 @@ def instance_means(grid: Tensor, labels: Tensor, count: int) -> tuple[Tensor, Te
     return sums / areas.masked_fill(areas == 0, torch.nan), areas
 
 
-class Labels:
+class InstanceLabels:
     """The instances of every photo; K is the largest number in a photo."""
 
     def __init__(
@@ -100,7 +110,7 @@ class Labels:
         counts = [len(s) for s in static]
         self.most = max([*counts, 1])
         clean = [
-            np.where((label > 0) & (True if s is None else s), label, 0).astype(smallest_type(self.most))
+            np.where((label > 0) & (True if s is None else s), label, 0).astype(label_dtype(self.most))
             for label, s in zip(labels, seen, strict=True)
         ]
         self._of_pixel = [torch.from_numpy(label.ravel()).to(device) for label in clean]
@@ -135,15 +145,15 @@ class Labels:
         return F.pad(values, (1, 0)).index_select(0, self.of_pixel(view)).view(shape)
 
 
-def smallest_type(most: int) -> type[np.uint8 | np.int32]:
+def label_dtype(most: int) -> type[np.uint8 | np.int32]:
     """Return the type in which labels up to `most` take least memory."""
     return np.uint8 if most < 256 else np.int32
 
 
 def make_masks(
     view: int,
-    maps: Maps,
-    labels: Labels,
+    maps: ComparisonMaps,
+    labels: InstanceLabels,
     others: tuple[Tensor, Tensor],
     w2: Tensor | float,
     config: MaskConfig,
@@ -173,8 +183,8 @@ def make_masks(
     values = [means, distances]
     if config.scope == "scene":
         values = [_with_row(rows, view, row).view(-1) for rows, row in zip(others, values)]
-    pool = pool_of(values[0])
-    cut = t_ent(pool, w2, config.threshold, config.gate, config.floor, config.hard).below(ceiling)
+    pool = instance_stats(values[0])
+    cut = t_ent(pool, w2, config.threshold, config.gate, config.floor, config.hard).capped(ceiling)
     flagged = means > cut.threshold
     if config.statistic != "structure" and config.disagree > 0:
         # an instance whose identity psi is unsure of is no distractor if the render agrees with the photo
@@ -199,14 +209,14 @@ def make_masks(
     global_ = nothing
     if config.use_global:
         by_pixel = config.statistic == "structure"
-        global_ = connected[0] if by_pixel else enlarge(global_of(maps, config), *shape)
+        global_ = connected[0] if by_pixel else enlarge(global_mask_from_maps(maps, config), *shape)
     final = connected[-1] if fused else local | global_
     if static is not None:
         # no mask contains static instances
         final, global_ = final & ~static, global_ & ~static
     if maskable is not None:
         final = final & maskable
-    final = grown(final, config, judging)
+    final = final_mask(final, config, judging)
     if maskable is not None:
         final = final & maskable
     if moving is not None:
@@ -228,10 +238,12 @@ class MaskStore:
         config: RefineSplatConfig,
         data: TrainData,
         surfaces: Sequence[np.ndarray | None],  # inverse depths of the sparse points
-        looks: Mapping[int, InitialMaskPrior],
+        priors: Mapping[int, InitialMaskPrior],
         labels: Sequence[np.ndarray],  # [H, W] int instances, 0 = none
         static: Sequence[np.ndarray],  # [K of the photo] bool, not to be masked
-        compare: Callable[[Step], Maps],  # on the feature grid; called only if the statistic needs it
+        compare: Callable[
+            [Step], ComparisonMaps
+        ],  # on the feature grid; called only if the statistic needs it
     ) -> None:
         self.config, self.compare = config, compare
         photos, cameras, device = data.photos, data.cameras, data.device
@@ -239,21 +251,23 @@ class MaskStore:
         structure = config.mask.statistic == "structure"
         # features are judged on their whole grid
         judged = (self.pixels.seen[view] if structure else None for view in range(len(photos)))
-        self.labels = Labels(labels, static, (None if s is None else s.cpu().numpy() for s in judged), device)
+        self.labels = InstanceLabels(
+            labels, static, (None if s is None else s.cpu().numpy() for s in judged), device
+        )
         sizes = [(camera.height, camera.width) for camera in cameras]
 
         def factor(view: int) -> np.ndarray | None:
-            look = looks.get(view)
-            return None if look is None or look.weight == 1 else look.factor(sizes[view])
+            prior = priors.get(view)
+            return None if prior is None or prior.weight == 1 else prior.factor(sizes[view])
 
         def maskable(view: int) -> np.ndarray | None:
-            look = looks.get(view)
-            keep = None if look is None or not look.within else look.keep(sizes[view])
+            prior = priors.get(view)
+            keep = None if prior is None or not prior.within else prior.keep(sizes[view])
             return None if keep is None else ~keep
 
         def moving(view: int) -> np.ndarray | None:
-            look = looks.get(view)
-            return None if look is None else look.moving(sizes[view])
+            prior = priors.get(view)
+            return None if prior is None else prior.moving(sizes[view])
 
         # factor of the evidence of each view, [H, W]; None if it is 1
         self.factors = EnlargedMaps(factor, len(photos), device)
@@ -261,7 +275,7 @@ class MaskStore:
         self.maskable = EnlargedMaps(maskable, len(photos), device)
         # pixels of each view that move for certain, [H, W] bool; None if none do
         self.moving = EnlargedMaps(moving, len(photos), device)
-        self.limited = {view: config.mask.limited(look.most) for view, look in looks.items()}
+        self.limited = {view: config.mask.limited(prior.most) for view, prior in priors.items()}
         self.keeps: dict[int, Tensor] = {}  # view -> its keep map [H, W] uint8, if it has one
         wide, views = torch.float64, len(photos)
         # [views, K] mean of every instance when its mask was last made, NaN for missing ones
@@ -275,7 +289,7 @@ class MaskStore:
         """Compute the mask of the step's view, store its evidence for other views, and learn w2."""
         view, config = step.view, self.config.mask
         with backend_of(self.theta.device).all_threads():
-            _, masks = self.examine(step, remember=True)
+            _, masks = self.examine(step, store=True)
         self.means[view].copy_(masks.means)
         self.distances[view].copy_(masks.distances)
         if config.w2 is None:
@@ -296,28 +310,28 @@ class MaskStore:
         )
         price = middle + (max(config.disagree, 1.0) if config.disagree > 0 else PRICE) * spread
         costs = distances / price.clamp(min=1e-12)
-        self.theta = learnt(self.theta, masks.pool, costs, areas, masks.cut.floor, config.threshold)
+        self.theta = updated_theta(self.theta, masks.pool, costs, areas, masks.cut.floor, config.threshold)
 
     @torch.no_grad()
-    def examine(self, step: Step, *, remember: bool = False) -> tuple[Maps, PhotoMasks]:
+    def examine(self, step: Step, *, store: bool = False) -> tuple[ComparisonMaps, PhotoMasks]:
         """Return the maps of the step's view and its masks at the photo's own size.
 
         Args:
             step: step of any train view.
-            remember: whether to store the evidence for other views.
+            store: whether to store the evidence for other views.
         """
         view, rendered = step.view, step.rendered
         mask = self.limited.get(view, self.config.mask)
         ceiling = maskable = None
         if mask.statistic == "structure":
             image, alpha, depth = (t.detach() for t in (rendered.image, rendered.alpha, rendered.depth))
-            evidence, unit = self.pixels.look(view, image, alpha, depth, remember=remember)
+            evidence, unit = self.pixels.compute(view, image, alpha, depth, store=store)
             factor = self.factors[view]
             if factor is not None:
                 evidence = evidence * factor
             if mask.entropy_weight > 0:
-                evidence = scaled_by(evidence, self.compare(step).statistic, mask.entropy_weight)
-            maps = Maps(evidence, evidence)
+                evidence = scale_by_identities(evidence, self.compare(step).statistic, mask.entropy_weight)
+            maps = ComparisonMaps(evidence, evidence)
             maskable, ceiling = self.pixels.seen[view], self.pixels.ceiling(unit)
         else:
             maps = self.compare(step)
@@ -336,11 +350,14 @@ class MaskStore:
         return float(torch.sigmoid(self.theta)) if self.config.mask.w2 is None else self.config.mask.w2
 
     @property
-    def judged(self) -> dict[int, Judged]:
+    def judged(self) -> dict[int, InstanceStatistics]:
         """Each view's instances when its mask was last made."""
         means, distances, areas = (t.cpu().numpy() for t in (self.means, self.distances, self.labels.areas))
         known = self.labels.known
-        return {v: Judged(*(rows[v, known[v]] for rows in (means, distances, areas))) for v in self.keeps}
+        return {
+            v: InstanceStatistics(*(rows[v, known[v]] for rows in (means, distances, areas)))
+            for v in self.keeps
+        }
 
     @property
     def shares(self) -> dict[int, tuple[float, float, float, float]]:

@@ -53,7 +53,9 @@ class MergeConfig:
 
 
 @torch.no_grad()
-def merged(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -> tuple[Tensor, Gaussians] | None:
+def merge_gaussians(
+    gaussians: Gaussians, candidates: Tensor, config: MergeConfig
+) -> tuple[Tensor, Gaussians] | None:
     """Merge Gaussians, the most overlapping pairs first.
 
     Args:
@@ -66,7 +68,7 @@ def merged(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -> tup
     """
     pairs = merge_pairs(gaussians, candidates, config)
     if config.most == 2:
-        couples = pairs[matching(len(gaussians), pairs)]
+        couples = pairs[greedy_matching(len(gaussians), pairs)]
         rows, cluster = couples.flatten(), torch.arange(len(couples), device=pairs.device)
         cluster = cluster.repeat_interleave(2, output_size=len(rows))
     else:
@@ -77,11 +79,11 @@ def merged(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -> tup
 
 
 def merge_pairs(gaussians: Gaussians, candidates: Tensor, config: MergeConfig) -> Tensor:
-    """Return pairs of rows [n, 2] int64 to merge, the most overlapping first; arguments as of `merged`."""
+    """Return pairs of rows [n, 2] int64 to merge, the most overlapping first; see `merge_gaussians`."""
     rows = torch.nonzero(candidates).squeeze(1)
     if len(rows) < 2:
         return rows.new_zeros((0, 2))
-    chosen = gaussians.of_degree(0).select(rows)  # higher harmonics are not compared
+    chosen = gaussians.with_sh_degree(0).select(rows)  # higher harmonics are not compared
     # many centres coincide after cloning: a point itself may not be among its neighbours
     near = backend_of(rows.device).neighbours(chosen.means, min(config.neighbours + 1, len(rows)))
     i = torch.arange(len(rows), device=rows.device)[:, None].expand_as(near)
@@ -151,7 +153,7 @@ def _factors(normed: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[Tenso
     return (l10, l20, l21), (second, third)
 
 
-def matching(count: int, pairs: Tensor) -> Tensor:
+def greedy_matching(count: int, pairs: Tensor) -> Tensor:
     """Choose pairs greedily in this order, each row at most once, [n] bool.
 
     A pair that is the first of both its rows is always chosen. So all of these are chosen at once, and then

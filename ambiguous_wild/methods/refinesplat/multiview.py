@@ -39,12 +39,12 @@ from ambiguous_wild.methods.refinesplat.maps import (
     WHITE,
     EnlargedMaps,
     MapStack,
-    Ranks,
-    Selected,
-    agree,
+    SelectedMaps,
+    ViewQuantile,
     agreement_weight,
+    colours_agree,
     common_offset,
-    sized,
+    to_device,
 )
 from ambiguous_wild.methods.refinesplat.structure import blur_and_shrink, nearest
 from ambiguous_wild.methods.refinesplat.view_lookup import COLOURS, combine, look_up
@@ -113,13 +113,13 @@ class _NeighbourRays:
     rays: Tensor  # [n, 3, P] at depth 1
     origin: Tensor  # [n, 3, 1]
     colours: Tensor  # [3, P] in the view's photo, 0 to 255
-    stored: Selected  # evidence of the neighbours, and their colours from 0 to 255
-    depth: Selected
-    surface: Selected  # depth of the sparse points
+    stored: SelectedMaps  # evidence of the neighbours, and their colours from 0 to 255
+    depth: SelectedMaps
+    surface: SelectedMaps  # depth of the sparse points
 
 
 @dataclass(frozen=True)
-class _Answers:
+class _ViewEvidence:
     """The evidence of n views about P points of another view, [n, P] each."""
 
     evidence: Tensor  # float32, NaN where a view sees another surface or none
@@ -127,7 +127,7 @@ class _Answers:
     agree: Tensor  # bool, where it sees the surface in the same colour
 
 
-class OtherViews:
+class MultiViewStore:
     """The last evidence of every view about the surfaces it shows, in four stacks of maps."""
 
     def __init__(
@@ -143,16 +143,16 @@ class OtherViews:
         self.sizes = [half_size(camera)[::-1] for camera in cameras]  # (height, width)
         self.near = near = nearest_views(cameras, config.views)
         self.count = len(near[0])
-        self.ranks = Ranks(self.count, config.quantile, device)
+        self.ranks = ViewQuantile(self.count, config.quantile, device)
         self.evidence = MapStack(self.sizes, device, pad="edge")
         # from 0 to 255
         self.colours = MapStack(self.sizes, device, channels=3, dtype=torch.uint8, pad="edge")
         for view, (photo, camera) in enumerate(zip(photos, cameras, strict=True)):
             for channel, plane in enumerate(np.moveaxis(small_colours(photo, half_size(camera)), 2, 0)):
-                self.colours.put(view, sized(plane, device), channel)
+                self.colours.put(view, to_device(plane, device), channel)
         self.depth = MapStack(self.sizes, device)
         # copied to `surface` once the view has stored evidence, like its depth
-        self.known_surfaces = [None if s is None else sized(_depths(s), device) for s in sparse]
+        self.known_surfaces = [None if s is None else to_device(_depths(s), device) for s in sparse]
         self.surface = MapStack([(1, 1) if s is None else s.shape for s in sparse], device)
         # depth of the sparse points' surface of each view, [h, w], NaN if none
         self.sparse_depth = EnlargedMaps(
@@ -164,11 +164,11 @@ class OtherViews:
         for camera, (h, w) in zip(cameras, self.sizes):
             if (camera.height, camera.width) not in shrinks:
                 shrinks[camera.height, camera.width] = (
-                    sized(blur_and_shrink(camera.height, h, SPREAD), device),
-                    sized(blur_and_shrink(camera.width, w, SPREAD).T, device),
+                    to_device(blur_and_shrink(camera.height, h, SPREAD), device),
+                    to_device(blur_and_shrink(camera.width, w, SPREAD).T, device),
                 )
         self.queries = [
-            _query_of(
+            _query(
                 view,
                 cameras,
                 near[view],
@@ -179,9 +179,9 @@ class OtherViews:
         ]
 
         if self.count:
-            self.ask(0, torch.zeros(self.sizes[0], device=device))  # compiles the CPU's kernels
+            self.query(0, torch.zeros(self.sizes[0], device=device))  # compiles the CPU's kernels
 
-    def remember(self, view: int, evidence: Tensor, depth: Tensor) -> None:
+    def store(self, view: int, evidence: Tensor, depth: Tensor) -> None:
         """Store the evidence of a view.
 
         Args:
@@ -213,7 +213,7 @@ class OtherViews:
         """Resize an expected depth to half the photo's size, [h, w]."""
         return nearest(depth, self.sizes[view])
 
-    def ask(self, view: int, depth: Tensor) -> MultiViewEvidence | None:
+    def query(self, view: int, depth: Tensor) -> MultiViewEvidence | None:
         """Return other views' evidence about the surface at each pixel; None if there is no other view.
 
         Args:
@@ -226,7 +226,7 @@ class OtherViews:
         # also in the first round: to wait until all neighbours have evidence gave 16.9 dB instead of 18.7
         least = min(config.seen_by, len(self.stored_views.intersection(self.near[view])))
         if backend_of(depth.device).kernels:
-            return MultiViewEvidence(*self._ask_kernels(view, depth, least))
+            return MultiViewEvidence(*self._query_kernels(view, depth, least))
         points = _NeighbourRays(
             torch.addcmul(torch.addcmul(own.ahead, own.down, own.y), own.right, own.x).flatten(2),
             own.origin,
@@ -240,7 +240,7 @@ class OtherViews:
         if difference is not None:
             some, same = (_every_second(t, shape) for t in (difference, answers.same))
             offset = common_offset(some, same, config.agree)
-            answers = replace(answers, agree=agree(difference, answers.same, config.agree, offset))
+            answers = replace(answers, agree=colours_agree(difference, answers.same, config.agree, offset))
         few = answers.same.sum(0) < config.known_by
         sparse_depth = self.sparse_depth[view]
         if sparse_depth is not None:
@@ -252,7 +252,7 @@ class OtherViews:
         maps = (evidence, weight.float(), coverage.float())
         return MultiViewEvidence(*(x.view(shape) for x in maps))
 
-    def _ask_kernels(self, view: int, depth: Tensor, least: int) -> Tensor:
+    def _query_kernels(self, view: int, depth: Tensor, least: int) -> Tensor:
         """Return evidence, weight and coverage [3, h, w] by the kernels of the CPU."""
         own, config = self.queries[view], self.config
         n, (h, w) = self.count, depth.shape
@@ -266,18 +266,23 @@ class OtherViews:
         evidence, same = np.empty((n, h, w), np.float32), np.empty((n, h, w), np.bool_)
         difference, offset = np.empty((n, h, w, 3), np.float32), np.zeros((n, 3), np.float32)
         counts, out = np.zeros((n, 3, COLOURS), np.int64), np.empty((3, h, w), np.float32)
-        found = evidence, same, difference, offset
-        look_up(*rays, depth.numpy(), near, view, evidences, colours, depths, shares, rules, counts, *found)
+        buffers = evidence, same, difference, offset
+        look_up(*rays, depth.numpy(), near, view, evidences, colours, depths, shares, rules, counts, *buffers)
         sparse_depth = self.sparse_depth[view]
         sparse = np.empty((0, 0), np.float32) if sparse_depth is None else sparse_depth.numpy()
         combine(
             *rays, sparse, near, view, evidences, colours, depths, surfaces, shares, surface_shares,
-            rules, least, self.ranks.pair.numpy(), self.ranks.share.numpy(), *found, out,
+            rules, least, self.ranks.pair.numpy(), self.ranks.share.numpy(), *buffers, out,
         )  # fmt: skip
         return torch.from_numpy(out)
 
     def _look_up_sparse(
-        self, points: _NeighbourRays, depth: Tensor, answers: _Answers, few: Tensor, offset: Tensor | None
+        self,
+        points: _NeighbourRays,
+        depth: Tensor,
+        answers: _ViewEvidence,
+        few: Tensor,
+        offset: Tensor | None,
     ) -> None:
         """Use evidence about the sparse points' surface where more views see it than the render's.
 
@@ -294,7 +299,7 @@ class OtherViews:
         rows = backend_of(few.device).visible_rows(lambda: few & depth.isfinite())
         other, difference = self._look_up(points, rows, depth[rows], sparse=True)
         if difference is not None and offset is not None:
-            other = replace(other, agree=agree(difference, other.same, self.config.agree, offset))
+            other = replace(other, agree=colours_agree(difference, other.same, self.config.agree, offset))
         more = few[rows] & (other.same.sum(0) > answers.same[:, rows].sum(0))
         pairs = ((answers.evidence, other.evidence), (answers.same, other.same), (answers.agree, other.agree))
         for old, new in pairs:
@@ -303,7 +308,7 @@ class OtherViews:
 
     def _look_up(
         self, points: _NeighbourRays, rows: Tensor | slice, depth: Tensor, *, sparse: bool = False
-    ) -> tuple[_Answers, Tensor | None]:
+    ) -> tuple[_ViewEvidence, Tensor | None]:
         """Look up the neighbours' evidence at depths [P'] of some pixels.
 
         Args:
@@ -325,8 +330,8 @@ class OtherViews:
         theirs = points.stored.linear(places)[:, :, 0]
         evidence = torch.where(same, theirs[:, 0], torch.nan)
         if self.config.agree <= 0:
-            return _Answers(evidence, same, same.clone()), None
-        return _Answers(evidence, same, same), points.colours[:, rows] - theirs[:, 1:].round_()
+            return _ViewEvidence(evidence, same, same.clone()), None
+        return _ViewEvidence(evidence, same, same), points.colours[:, rows] - theirs[:, 1:].round_()
 
     def _near(self, surface_z: Tensor, z: Tensor) -> Tensor:
         """Return which points of depth z lie on a view's surface of depth `surface_z`; 0 = no surface."""
@@ -336,7 +341,7 @@ class OtherViews:
 def compile_kernels() -> None:
     """Compile the kernels that look up evidence on the CPU."""
     camera, photo = Camera(2, 2, 1.0, 1.0, 1.0, 1.0, np.eye(4)), np.zeros((2, 2, 3), np.float32)
-    OtherViews([camera] * 2, [photo] * 2, MultiViewConfig(), [], "cpu")
+    MultiViewStore([camera] * 2, [photo] * 2, MultiViewConfig(), [], "cpu")
 
 
 def _every_second(x: Tensor, shape: torch.Size) -> Tensor:
@@ -353,7 +358,7 @@ def discount(
 
     Args:
         evidence: [H, W] >= 0.
-        others: result of `OtherViews.ask`, any size; NaN evidence discounts nothing.
+        others: result of `MultiViewStore.query`, any size; NaN evidence discounts nothing.
         unit: normal evidence in the scene, 0-d, above 0.
         config: strength and `free`.
     """
@@ -364,7 +369,7 @@ def discount(
     return evidence * resized(others.coverage, *evidence.shape) / (1.0 + config.strength * at_pixels).sqrt_()
 
 
-def _query_of(
+def _query(
     view: int,
     cameras: Sequence[Camera],
     near: Sequence[int],
@@ -380,7 +385,7 @@ def _query_of(
         frames[row, 0] = 2.0 * o.fx / o.width * pose[0] + (2.0 * o.cx / o.width - 1.0) * pose[2]
         frames[row, 1] = 2.0 * o.fy / o.height * pose[1] + (2.0 * o.cy / o.height - 1.0) * pose[2]
         frames[row, 2] = pose[2]
-    right, down, ahead = (sized(frames[:, :, k, None, None], device) for k in range(3))
+    right, down, ahead = (to_device(frames[:, :, k, None, None], device) for k in range(3))
     x = ((np.arange(w) + 0.5) * (camera.width / w) - camera.cx) / camera.fx
     y = ((np.arange(h) + 0.5) * (camera.height / h) - camera.cy) / camera.fy
     return _Query(
@@ -389,9 +394,9 @@ def _query_of(
         right=right,
         down=down,
         ahead=ahead,
-        origin=sized(frames[:, :, 3:], device),
-        x=sized(x, device),
-        y=sized(y[:, None], device),
+        origin=to_device(frames[:, :, 3:], device),
+        x=to_device(x, device),
+        y=to_device(y[:, None], device),
         shrink=shrink,
     )
 

@@ -12,9 +12,9 @@ from typing import Literal
 
 from ambiguous_wild.methods.refinesplat.density_control import EntropyDensityConfig, SupportConfig
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
-from ambiguous_wild.methods.refinesplat.mask_prior import FirstLookConfig
+from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPriorConfig
 from ambiguous_wild.methods.refinesplat.merging import MergeConfig
-from ambiguous_wild.vision.backends import BY_MACHINE, first_here
+from ambiguous_wild.vision.backends import BY_MACHINE, first_available
 
 # Masks by entropy (Eqs. 3 to 7). Two forms are repaired: Kapur's for the additive objective of T_ent, and the
 # standard deviation for the variance in T_glb. Of our gates and limits only `most` is on.
@@ -60,7 +60,7 @@ def features(size: str = "") -> str:
     Args:
         size: size of the net's input as in the name of a back end, e.g. "@504".
     """
-    return first_here(f"dinov2-small{size}", "efficientnet-lite0", "labhog")
+    return first_available(f"dinov2-small{size}", "efficientnet-lite0", "labhog")
 
 
 def instances() -> str:
@@ -68,7 +68,7 @@ def instances() -> str:
 
     Otherwise segments grouped by EfficientNet-Lite0, and without its weights `graph`.
     """
-    return first_here("sam2", "efficientnet-lite0", "graph")
+    return first_available("sam2", "efficientnet-lite0", "graph")
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class PaperConfig(RefineSplatConfig):
     """All parts of the paper; its networks depend on this machine, see `features`, `instances`."""
 
     mask: MaskConfig = MASK
-    first_look: FirstLookConfig = FirstLookConfig(on=False)  # noqa: RUF009
+    first_look: InitialMaskPriorConfig = InitialMaskPriorConfig(on=False)  # noqa: RUF009
     features: str = field(default_factory=features, metadata=BY_MACHINE)
     instances: str = field(default_factory=instances, metadata=BY_MACHINE)
     untracked: Literal["drop", "add"] = "add"

@@ -26,10 +26,10 @@ from ambiguous_wild.core.config import State
 from ambiguous_wild.methods.masking_common import resized
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig
 from ambiguous_wild.methods.refinesplat.maps import EnlargedMaps, low_quantile, median
-from ambiguous_wild.methods.refinesplat.multiview import OtherViews, discount
-from ambiguous_wild.methods.refinesplat.structure import structure_residual, unrelated_residual
+from ambiguous_wild.methods.refinesplat.multiview import MultiViewStore, discount
+from ambiguous_wild.methods.refinesplat.structure import structure_residual, unrelated_pair_residual
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.vision.sparse_surface import seldom_seen
+from ambiguous_wild.vision.sparse_surface import rarely_covered
 
 GAPS = 1.25  # a mask with filled gaps may be this many times its limit
 _JUMPS = 3  # three jumps need half as many rounds as one; more do not help
@@ -117,7 +117,7 @@ def dilate(mask: Tensor, size: int) -> Tensor:
     return F.max_pool2d(mask[None].float(), size, 1, size // 2)[0] > 0.5
 
 
-def grown(masked: Tensor, config: MaskConfig, evidence: Tensor) -> Tensor:
+def final_mask(masked: Tensor, config: MaskConfig, evidence: Tensor) -> Tensor:
     """Make M_final [H, W] bool: limit the mask's size, fill its gaps, dilate it.
 
     If the mask is too large, its surest pixels stay. Their gaps are filled too, because a mask with specks
@@ -160,22 +160,22 @@ class PixelEvidence:
         self.config = config
         self.photos = photos
         on_host = (photo.cpu().numpy() for photo in photos)  # one at a time: all may not fit
-        self.other_views = OtherViews(cameras, on_host, config.multiview, surfaces, device)
-        unseen = seldom_seen(cameras, surfaces, config.multiview.seen_by) or [None] * len(cameras)
+        self.other_views = MultiViewStore(cameras, on_host, config.multiview, surfaces, device)
+        unseen = rarely_covered(cameras, surfaces, config.multiview.seen_by) or [None] * len(cameras)
         # [H, W] bool of each view: pixels that enough other photos see; None: all
         self.seen = EnlargedMaps(
             lambda view: _seen(unseen[view], (cameras[view].height, cameras[view].width)),
             len(cameras),
             device,
         )
-        self.unrelated = unrelated_residual(photos, config.base)
-        # normal residual of each view's static pixels; NaN before the first `look`
+        self.unrelated = unrelated_pair_residual(photos, config.base)
+        # normal residual of each view's static pixels; NaN before the first `compute`
         self.normal = torch.full((len(photos),), torch.nan, dtype=torch.float64, device=device)
         # view -> its residual, averaged over its visits, [H, W] float16
         self.before: dict[int, Tensor] = {}
 
-    def look(
-        self, view: int, image: Tensor, alpha: Tensor, depth: Tensor, *, remember: bool
+    def compute(
+        self, view: int, image: Tensor, alpha: Tensor, depth: Tensor, *, store: bool
     ) -> tuple[Tensor, Tensor]:
         """Return the evidence of a view in units, and the unit.
 
@@ -184,7 +184,7 @@ class PixelEvidence:
             image: render of its camera, [h, w, 3], any size.
             alpha: opacity of the render, [h, w]; below `least_alpha` there is no evidence.
             depth: sum of weight times z, [h, w].
-            remember: whether to store the evidence for other views.
+            store: whether to store the evidence for other views.
 
         Returns:
             Evidence [H, W] float32 at the photo's size, and the unit, 0-d float64.
@@ -202,10 +202,10 @@ class PixelEvidence:
         if config.multiview.strength > 0:
             mean_depth = depth / alpha.clamp(min=1e-3) * (alpha > 1e-3)
             halved = self.other_views.halved(view, mean_depth)
-            others = self.other_views.ask(view, halved)
-            if remember:
-                self.other_views.remember(view, evidence, halved)
-        if remember:
+            others = self.other_views.query(view, halved)
+            if store:
+                self.other_views.store(view, evidence, halved)
+        if store:
             self.normal[view].copy_(torch.where(count > 0, normal, self.normal[view]))
             if config.memory > 0:
                 self.before[view] = evidence.half()
@@ -213,7 +213,7 @@ class PixelEvidence:
         return discount(evidence, others, unit, config.multiview) / unit, unit
 
     def ceiling(self, unit: Tensor) -> Tensor | None:
-        """Return the upper limit of thresholds in the unit of `look`, 0-d; None: no limit.
+        """Return the upper limit of thresholds in the unit of `compute`, 0-d; None: no limit.
 
         It is the share `ceiling` of the residual of unrelated pictures, but at least `ceiling_least`, because
         while little is learnt every pixel has such a residual.

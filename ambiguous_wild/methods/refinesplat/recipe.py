@@ -23,7 +23,7 @@ from ambiguous_wild.io.motion_points import MotionPoints, read_motion_points
 from ambiguous_wild.methods.masking_common import PausingMask, resized
 from ambiguous_wild.methods.refinesplat import mask_pictures
 from ambiguous_wild.methods.refinesplat.density_control import EntropyAwareDensity
-from ambiguous_wild.methods.refinesplat.evidence import Maps, compare, mask_unlearnt
+from ambiguous_wild.methods.refinesplat.evidence import ComparisonMaps, compare, mask_unlearnt
 from ambiguous_wild.methods.refinesplat.hyperparameters import RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.inputs import FrozenInputs
 from ambiguous_wild.methods.refinesplat.maps import EnlargedMaps
@@ -127,7 +127,7 @@ class RefineSplatMask(PausingMask):
         self.instances = instances or _instances(config)
         self.visits: dict[int, int] = {}  # view -> number of steps since masks began
         self.points: dict[str, MotionPoints] = {}  # photo's name -> its moving and static features
-        self.looks: dict[int, InitialMaskPrior] = {}  # view -> its comparison with other photos, if any
+        self.priors: dict[int, InitialMaskPrior] = {}  # view -> its comparison with other photos, if any
 
     def setup(self, data: TrainData) -> None:
         self.data = data
@@ -139,16 +139,16 @@ class RefineSplatMask(PausingMask):
         if config.first_look.on:
             moving, certain = self._moving(surfaces) if config.first_look.motion > 0 else (None, None)
             photos = (photo.cpu().numpy() for photo in data.photos)  # one at a time: all may not fit
-            looks = initial_mask_prior(data.cameras, photos, surfaces, config.first_look, moving, certain)
-            self.looks = {view: look for view, look in enumerate(looks) if look is not None}
+            priors = initial_mask_prior(data.cameras, photos, surfaces, config.first_look, moving, certain)
+            self.priors = {view: prior for view, prior in enumerate(priors) if prior is not None}
         labels, static = self.inputs.labels, self.inputs.static
-        self.masks = MaskStore(config, data, surfaces, self.looks, labels, static, self.compare)
+        self.masks = MaskStore(config, data, surfaces, self.priors, labels, static, self.compare)
         # keep map of each view before masks begin, [H, W] bool; None if everything is kept
         self.first = EnlargedMaps(self._first_keep, len(data.photos), data.device)
 
     def _first_keep(self, view: int) -> np.ndarray | None:
-        look, camera = self.looks.get(view), self.data.cameras[view]
-        return None if look is None else look.keep((camera.height, camera.width))
+        prior, camera = self.priors.get(view), self.data.cameras[view]
+        return None if prior is None else prior.keep((camera.height, camera.width))
 
     def _moving(
         self, surfaces: list[np.ndarray | None]
@@ -226,8 +226,8 @@ class RefineSplatMask(PausingMask):
             "masked_share_global": float(mean[2]),
             "t_ent_mean": float(finite.mean()) if len(finite) else None,
             "w2": self.masks.w2,
-            # mean share of a photo that the first look masks
-            "first_look_share": masked_share([look.passing for look in self.looks.values()]),
+            # mean share of a photo that the prior masks
+            "first_look_share": masked_share([prior.passing for prior in self.priors.values()]),
             # not if only pictures read identities
             "identities": self.inputs.semantics.association.count if self._reads_identities else None,
         }
@@ -238,7 +238,7 @@ class RefineSplatMask(PausingMask):
         return self.config.mask.needs_identities or self.regularises()
 
     @torch.no_grad()
-    def compare(self, step: Step) -> Maps:
+    def compare(self, step: Step) -> ComparisonMaps:
         """Compute entropy and distances on the feature grid from the step's render."""
         frozen, mask = self.inputs.semantics, self.config.mask
         features = self.inputs.features

@@ -34,7 +34,7 @@ def structure_residual(photo: Tensor, render: Tensor, base: float = 0.3) -> Tens
         render: render of the same camera and size.
         base: factor of the residual where the structure agrees perfectly.
     """
-    residual = box(_channels((photo - render).abs_(), (1 / 3, 1 / 3, 1 / 3))[None], RESIDUAL_BOX)[0]
+    residual = box_filter(_channels((photo - render).abs_(), (1 / 3, 1 / 3, 1 / 3))[None], RESIDUAL_BOX)[0]
     a, b = (_channels(image, GREY.tolist()) for image in (photo, render))
     return residual * (1.0 + base - correlation(a, b))
 
@@ -45,7 +45,7 @@ def _channels(image: Tensor, weights: Sequence[float]) -> Tensor:
     return torch.add(torch.add(first * weights[0], second, alpha=weights[1]), third, alpha=weights[2])
 
 
-def unrelated_residual(photos: Sequence[Tensor], base: float = 0.3) -> float:
+def unrelated_pair_residual(photos: Sequence[Tensor], base: float = 0.3) -> float:
     """Return the `structure_residual` of two unrelated pictures.
 
     It is the median over pixels, then over photos, of each photo against the mirror image of another: the
@@ -71,13 +71,13 @@ def correlation(a: Tensor, b: Tensor) -> Tensor:
     shares no structure with it.
     """
     # variances are small differences of these means
-    mean_a, mean_b, aa, bb, ab = box(torch.stack([a, b, a * a, b * b, a * b]), STRUCTURE_BOX)
+    mean_a, mean_b, aa, bb, ab = box_filter(torch.stack([a, b, a * a, b * b, a * b]), STRUCTURE_BOX)
     var_a, var_b = (aa - mean_a * mean_a).clamp_(min=0.0), (bb - mean_b * mean_b).clamp_(min=0.0)
     common = (ab - mean_a * mean_b).add_(NOISE)
     return common.div_((var_a.add_(NOISE) * var_b.add_(NOISE)).sqrt_()).clamp_(-1.0, 1.0)
 
 
-def box(maps: Tensor, size: int) -> Tensor:
+def box_filter(maps: Tensor, size: int) -> Tensor:
     """Filter maps [n, H, W] by a box of odd `size`, summed in float64; the border is replicated."""
     if backend_of(maps.device).kernels:
         # a tenth of the time of torch's pooling

@@ -53,7 +53,7 @@ def entropy(logits: Tensor, variant: Variant = "sigmoid") -> Tensor:
     raise unknown("entropy variant", variant, ("sigmoid", "softmax"))
 
 
-def surprise(render: Tensor, photo: Tensor, variant: Variant = "sigmoid") -> Tensor:
+def cross_entropy(render: Tensor, photo: Tensor, variant: Variant = "sigmoid") -> Tensor:
     """Return the cross-entropy in nats of the render's identities under the photo's, H(p_I, p_render).
 
     It equals the entropy of the photo's own identities where the render shows the same thing, and grows by
@@ -67,9 +67,9 @@ def surprise(render: Tensor, photo: Tensor, variant: Variant = "sigmoid") -> Ten
     raise unknown("entropy variant", variant, ("sigmoid", "softmax"))
 
 
-def contrast(render: Tensor, photo: Tensor, variant: Variant = "sigmoid") -> Tensor:
-    """Return KL(p_I || p_render) in nats: `surprise` without the photo's own ambiguity."""
-    return (surprise(render, photo, variant) - surprise(photo, photo, variant)).clamp(min=0.0)
+def kl_divergence(render: Tensor, photo: Tensor, variant: Variant = "sigmoid") -> Tensor:
+    """Return KL(p_I || p_render) in nats: `cross_entropy` without the photo's own ambiguity."""
+    return (cross_entropy(render, photo, variant) - cross_entropy(photo, photo, variant)).clamp(min=0.0)
 
 
 def _x_log_x(log_p: Tensor) -> Tensor:
@@ -108,7 +108,7 @@ class Threshold:
     threshold: Tensor  # 0-d float64, larger values are transient; inf = no value is an outlier
     floor: Tensor  # 0-d, bound of the gate: the larger of median + gate * robust spread and `least`
 
-    def below(self, ceiling: Tensor | None) -> Threshold:
+    def capped(self, ceiling: Tensor | None) -> Threshold:
         """Return the cut with threshold and floor limited to the ceiling."""
         if ceiling is None:
             return self
@@ -117,7 +117,7 @@ class Threshold:
         return Threshold(torch.minimum(self.threshold, ceiling), floor)
 
 
-def pool_of(values: Tensor) -> InstanceStats:
+def instance_stats(values: Tensor) -> InstanceStats:
     """Sort values [n] >= 0 float64 and compute their statistics; NaN = missing; n >= 1."""
     order, index = values.sort()
     x = order.nan_to_num(nan=0.0).clamp_(min=0.0)
@@ -198,7 +198,7 @@ def objective(pool: InstanceStats, w2: float | Tensor, form: Form = "kapur") -> 
     return upper + w2 * slope, slope
 
 
-def learnt(
+def updated_theta(
     theta: Tensor,
     pool: InstanceStats,
     costs: Tensor,

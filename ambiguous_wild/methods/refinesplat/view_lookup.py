@@ -1,4 +1,4 @@
-"""Other views' evidence about the surfaces of one view, on the CPU: `OtherViews.ask` in two kernels.
+"""Other views' evidence about the surfaces of one view, on the CPU: `MultiViewStore.query` in two kernels.
 
 Tensors of n views times P pixels took half of the time of a mask. The results differ from those of the
 tensors in the last bits of positions, so a test compares them.

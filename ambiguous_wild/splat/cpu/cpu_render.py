@@ -15,7 +15,7 @@ from ambiguous_wild.splat.cpu.buffers import BufferPool
 from ambiguous_wild.splat.cpu.compile import threads
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.rendered import (
-    NOTHING,
+    NO_STATISTICS,
     Cotangents,
     Gradients,
     Shade,
@@ -88,7 +88,7 @@ class RenderedCpu:
         self._camera = camera
         self._lists = lists
 
-    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
+    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NO_STATISTICS) -> Gradients:
         """Return the gradients of sum(cotangent * picture); may be called more than once.
 
         The Gaussians must still hold the values that were rendered.

@@ -64,6 +64,6 @@ def with_effects(hooks: MethodHooks, names: Sequence[str]) -> MethodHooks:
             continue
         module, cls = (EFFECTS | INITIALISATIONS)[name]
         effect = getattr(importlib.import_module(f"{__name__}.{module}"), cls)()
-        hooks = hooks.suited_to(effect)
+        hooks = hooks.with_effect(effect)
         built.append(effect)
     return dataclasses.replace(hooks, effects=(*hooks.effects, *built))

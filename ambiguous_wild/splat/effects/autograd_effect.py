@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import Facts, State
-from ambiguous_wild.splat.effects.base import Effect, RowAdam, decayed, rate_for_run_length
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, exponential_decay, rate_for_run_length
 from ambiguous_wild.splat.gaussians import PARAMETERS, Gaussians
 from ambiguous_wild.splat.rendered import (
     Cotangents,
@@ -49,15 +49,15 @@ class Leaf:
 
 
 @dataclass(frozen=True)
-class Visible:
-    """What `Learnt.forward` gets of the visible Gaussians."""
+class VisibleGaussians:
+    """The visible Gaussians, argument of `AutogradEffect.forward`."""
 
     base: Tensor  # [M, 3] colours of the harmonics in this direction, SH + 0.5, not clamped
     means: Tensor  # [M, 3] world
     attributes: Mapping[str, Tensor] = field(default_factory=dict)  # [M, ...] rows of `Gaussians.attributes`
 
 
-class Learnt(Effect):
+class AutogradEffect(Effect):
     """An effect with parameters. Override `leaves`, and one or more of `forward`, `change` and `tone`.
 
     Each gets `leaf`, the leaves by name; of a leaf per photo it gets the row of the view context's photo.
@@ -70,7 +70,7 @@ class Learnt(Effect):
         """Return what is learnt beside the attributes of Gaussians (`Effect.rows`)."""
         return {}
 
-    def forward(self, visible: Visible, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         """Return colours [M, 3] of the visible Gaussians; the renderer clamps them at 0."""
         return visible.base
 
@@ -129,7 +129,7 @@ class Learnt(Effect):
         return (
             super().acts(hook)
             if function is None
-            else getattr(type(self), function) is not getattr(Learnt, function)
+            else getattr(type(self), function) is not getattr(AutogradEffect, function)
         )
 
     def model(self, gaussians: Gaussians, context: ViewContext) -> tuple[Gaussians, Vjp]:
@@ -169,7 +169,7 @@ class Learnt(Effect):
         geometry = () if context.fitting else ({"means": means}, attributes)
         graph = _Graph(self._learns(leaf, context), {"base": base}, *geometry)
         with torch.enable_grad():
-            colours = self.forward(Visible(base, means, attributes), leaf, context)
+            colours = self.forward(VisibleGaussians(base, means, attributes), leaf, context)
 
         def vjp(d_colours: Tensor) -> ShadeGradients:
             gradients_of = graph.vjp([colours], [d_colours])
@@ -213,7 +213,7 @@ class Learnt(Effect):
             leaf = self._leaves[name]
             row = context.view if leaf.per_photo else 0
             assert row is not None
-            rate = decayed(leaf.rate, leaf.rate * leaf.lr_decay, context.progress)
+            rate = exponential_decay(leaf.rate, leaf.rate * leaf.lr_decay, context.progress)
             rate = rate if leaf.made_for is None else rate_for_run_length(rate, leaf.made_for, context)
             self._adam[name].step(row, gradient, rate, skip_step)
 

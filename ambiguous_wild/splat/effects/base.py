@@ -1,4 +1,4 @@
-"""What an effect is: a change before or after the render call, with a backward pass of its own.
+"""Base of effects: changes before or after the render call, each with its own backward pass.
 
     camera -> [poses] -> model -> [appearance] -> [3D filter] -> render -> image -> [exposure]
 
@@ -68,7 +68,7 @@ class Effect:
 
     def model(self, gaussians: Gaussians, context: ViewContext) -> tuple[Gaussians, Vjp]:
         """Return the Gaussians as they are drawn, all rows, and a vjp that changes no tensor in place."""
-        return gaussians, same
+        return gaussians, identity_vjp
 
     def shade(
         self, gaussians: Gaussians, rows: Tensor | slice, base: Tensor, context: ViewContext
@@ -82,7 +82,7 @@ class Effect:
         The effect learns from `Cotangents.image` alone: what a method gives as `extra` tells nothing about a
         photo's exposure.
         """
-        return frame, unchanged
+        return frame, identity_frame_vjp
 
     def pose(self, gaussians: Gaussians, gradients: Gradients, context: ViewContext) -> Mapping[str, Tensor]:
         """Return own gradients from a train photo's camera, given Gaussians and gradients of the render."""
@@ -122,13 +122,13 @@ class Effect:
         """Restore what `state_dict` returned; exact, so that a resumed run gives the same bits."""
 
 
-def same(gradients: Gradients) -> Gradients:
-    """Return the gradients: the vjp of an unchanged model."""
+def identity_vjp(gradients: Gradients) -> Gradients:
+    """Return the gradients: vjp of a hook that changes no Gaussians."""
     return gradients
 
 
-def unchanged(cotangents: Cotangents) -> Cotangents:
-    """Return the cotangents: the vjp of an unchanged picture."""
+def identity_frame_vjp(cotangents: Cotangents) -> Cotangents:
+    """Return the cotangents: vjp of a hook that changes no picture."""
     return cotangents
 
 
@@ -155,7 +155,7 @@ class RowAdam:
         first, second = self.first[row], self.second[row]
         weights: tuple[Any, Any] = (1 - self.betas[0], 1 - self.betas[1])
         if skip_step is not None:
-            go = share_of(skip_step, gradient)
+            go = step_factor(skip_step, gradient)
             gradient = gradient.masked_fill(go <= 0, 0.0)  # it may not be finite
             weights, rate = (weights[0] * go, weights[1] * go), rate * go
         first.lerp_(gradient, weights[0])
@@ -178,12 +178,12 @@ class RowAdam:
         self.steps = [int(n) for n in state["steps"]]
 
 
-def share_of(skip_step: Tensor, like: Tensor) -> Tensor:
+def step_factor(skip_step: Tensor, like: Tensor) -> Tensor:
     """Return 0 if the step was skipped, else 1, as a 0-d tensor in the type of `like`."""
     return 1.0 - skip_step.reshape(()).to(like)
 
 
-def decayed(first: float, last: float, progress: float) -> float:
+def exponential_decay(first: float, last: float, progress: float) -> float:
     """Decay exponentially from `first` to `last` over the run."""
     return float(first * (last / first) ** progress)
 

@@ -21,7 +21,13 @@ import torch
 from torch import Tensor
 
 from ambiguous_wild.core.config import Facts, State
-from ambiguous_wild.splat.effects.base import Effect, RowAdam, decayed, same, unchanged
+from ambiguous_wild.splat.effects.base import (
+    Effect,
+    RowAdam,
+    exponential_decay,
+    identity_frame_vjp,
+    identity_vjp,
+)
 from ambiguous_wild.splat.effects.geometry import SceneNormaliser
 from ambiguous_wild.splat.effects.tracks import photo_gains
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
@@ -67,7 +73,7 @@ class AffineExposure(Effect):
     def image(self, frame: Frame, context: ViewContext) -> tuple[Frame, FrameVjp]:
         row = context.row(self.views)
         if row is None:
-            return frame, unchanged
+            return frame, identity_frame_vjp
         matrix, offset = self._affine(row)
         before = frame.image
 
@@ -96,7 +102,7 @@ class AffineExposure(Effect):
         self.adam.step(
             context.view,
             effect_grads["affine"],
-            decayed(EXPOSURE_RATE, EXPOSURE_RATE_FINAL, context.progress),
+            exponential_decay(EXPOSURE_RATE, EXPOSURE_RATE_FINAL, context.progress),
             skip_step,
         )
         self._close()
@@ -153,7 +159,7 @@ class AppearanceEmbedding(Effect):
     def model(self, gaussians: Gaussians, context: ViewContext) -> tuple[Gaussians, Vjp]:
         row = context.row(self.views)
         if row is None:
-            return gaussians, same
+            return gaussians, identity_vjp
         leaves = self.net | {"row": self.rows_of_photos.values[row], "sh0": gaussians.sh0}
         leaves = {name: tensor.detach().clone().requires_grad_(True) for name, tensor in leaves.items()}
         with torch.enable_grad():
@@ -173,7 +179,7 @@ class AppearanceEmbedding(Effect):
         self, effect_grads: Mapping[str, Tensor], context: ViewContext, skip_step: Tensor | None = None
     ) -> None:
         assert context.view is not None
-        share = decayed(1.0, FINAL, context.progress)
+        share = exponential_decay(1.0, FINAL, context.progress)
         self.rows_of_photos.step(context.view, effect_grads["row"], RATE_ROWS * share, skip_step)
         for name, adam in self.moments.items():
             adam.step(0, effect_grads[name], RATE_NET * share, skip_step)

@@ -22,7 +22,7 @@ import numpy as np
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.splat.effects.base import Effect
-from ambiguous_wild.splat.effects.tracks import tracks_of
+from ambiguous_wild.splat.effects.tracks import point_indices_by_photo
 from ambiguous_wild.splat.step import TrainData
 
 
@@ -39,7 +39,9 @@ class DenseStart(Effect):
             return data.photos[view].cpu().numpy()
 
         keep = [None if k is None else k.cpu().numpy() for k in data.user_keep]
-        xyz, rgb = dense_points(data.cameras, photo, data.scene.points.xyz, tracks_of(data.scene), keep, most)
+        xyz, rgb = dense_points(
+            data.cameras, photo, data.scene.points.xyz, point_indices_by_photo(data.scene), keep, most
+        )
         self.count = len(xyz)
         return xyz, rgb
 

@@ -17,7 +17,7 @@ from ambiguous_wild.splat.fields import frames_of, renders_of
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.losses import photometric
 from ambiguous_wild.splat.rendered import (
-    NOTHING,
+    NO_STATISTICS,
     Cotangents,
     FrameVjp,
     Gradients,
@@ -30,7 +30,7 @@ from ambiguous_wild.splat.rendered import (
     frame_of,
     sum_effect_grads,
     sum_named,
-    sum_where,
+    sum_optional,
 )
 from ambiguous_wild.splat.step import Step, TrainData, ViewContext
 
@@ -217,7 +217,7 @@ def _vjp_all(vjps: Sequence[ShadeVjp], d_colours: Tensor) -> ShadeGradients:
         total = ShadeGradients(
             one.base,
             sum_named(one.attributes, total.attributes),
-            sum_where(one.means, total.means),
+            sum_optional(one.means, total.means),
             sum_effect_grads(total.effect_grads, one.effect_grads),
         )
     return total
@@ -275,7 +275,7 @@ class EffectRender:
         return self._inner.radii
 
     @torch.no_grad()
-    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NOTHING) -> Gradients:
+    def backward(self, cotangents: Cotangents | Tensor, needs: frozenset[str] = NO_STATISTICS) -> Gradients:
         """Do as `Rendered.backward`; gradients of the effects' own parameters are in `effect_grads`."""
         gradients = self._inner.backward(self.through_image_effects(cotangents), needs)
         for effect in self._posing:

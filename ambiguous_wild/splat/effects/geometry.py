@@ -60,7 +60,7 @@ def inside(pixels: Tensor, z: Tensor, camera: Camera, margin: float) -> Tensor:
     return (z > 0.01) & (u.abs() <= 0.5 + margin) & (v.abs() <= 0.5 + margin)
 
 
-def mean_of_seen(values: Tensor, means: Tensor, camera: Camera) -> Tensor:
+def mean_of_visible(values: Tensor, means: Tensor, camera: Camera) -> Tensor:
     """Average values over the rows that the camera may see; they are given for those of `visible_rows`."""
     return backend_of(means.device).mean_of_rows(values, lambda: in_picture(means, camera))
 

@@ -1,4 +1,4 @@
-"""The space close in front of the cameras, where nothing belongs: no floaters.
+"""Removes floaters close in front of the cameras.
 
 Floaters there explain one photo, and no other photo corrects them. With the effect `near`, what lies in a
 camera's picture nearer than a share of the depth of its nearest SfM points becomes transparent, and density
@@ -17,7 +17,7 @@ from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import Facts
 from ambiguous_wild.splat.effects.base import Effect
 from ambiguous_wild.splat.effects.geometry import inside, projected
-from ambiguous_wild.splat.effects.tracks import tracks_of
+from ambiguous_wild.splat.effects.tracks import point_indices_by_photo
 from ambiguous_wild.splat.gaussians import Gaussians
 from ambiguous_wild.splat.step import Step, TrainData
 
@@ -34,16 +34,16 @@ class NearSpace(Effect):
     name = "near"
 
     def setup(self, data: TrainData) -> None:
-        depths = nearest_depths(data.cameras, data.scene.points.xyz, tracks_of(data.scene))
+        depths = nearest_depths(data.cameras, data.scene.points.xyz, point_indices_by_photo(data.scene))
         # camera, depth up to which nothing belongs
         self.empty = [(camera, depth) for camera, depth in zip(data.cameras, depths, strict=True) if depth]
 
     @torch.no_grad()
     def after_step(self, step: Step, gaussians: Gaussians) -> None:
         if step.iteration % EVERY == 0:
-            gaussians.opacity_logits[self.holds(gaussians.means)] = GONE
+            gaussians.opacity_logits[self.contains(gaussians.means)] = GONE
 
-    def holds(self, means: Tensor) -> Tensor:
+    def contains(self, means: Tensor) -> Tensor:
         """Return which means [N, 3] lie in the empty space of any camera, [N] bool."""
         inside_any = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         for camera, depth in self.empty:
@@ -56,7 +56,7 @@ class NearSpace(Effect):
 
 
 def nearest_depths(cameras: Sequence[Camera], xyz: np.ndarray, seen: Sequence[np.ndarray]) -> list[float]:
-    """Return for each camera the depth up to which nothing belongs; 0 where it sees too few points.
+    """Return for each camera the depth of its empty space; 0 where it sees too few points.
 
     Args:
         cameras: cameras of the train photos.

@@ -17,7 +17,7 @@ from torch import Tensor
 from ambiguous_wild.core import Camera
 from ambiguous_wild.core.config import Facts, State
 from ambiguous_wild.splat.backend import backend_of
-from ambiguous_wild.splat.effects.base import Effect, RowAdam, decayed, share_of
+from ambiguous_wild.splat.effects.base import Effect, RowAdam, exponential_decay, step_factor
 from ambiguous_wild.splat.effects.device_cameras import PosedCamera, on_device, scaled
 from ambiguous_wild.splat.effects.geometry import higher_harmonics
 from ambiguous_wild.splat.gaussians import SH_C0, Gaussians
@@ -71,9 +71,9 @@ class PoseRefinement(Effect):
         if context.progress < BEGIN or context.view is None:
             return
         row = self.adam.values[context.view]
-        share = decayed(1.0, FINAL, context.progress)
+        share = exponential_decay(1.0, FINAL, context.progress)
         self.adam.step(context.view, effect_grads["motion"], self.rate * share, skip_step)
-        decay = PULL * share if skip_step is None else PULL * share * share_of(skip_step, row)
+        decay = PULL * share if skip_step is None else PULL * share * step_factor(skip_step, row)
         row *= 1 - decay  # decoupled from Adam's scaling, as weight decay is in AdamW
 
     def facts(self) -> Facts:

@@ -36,7 +36,7 @@ class Skybox(Effect):
         self.count = 0
 
     def setup(self, data: TrainData) -> None:
-        middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
+        middle, radius = skybox_sphere(data.cameras, data.scene.points.xyz)
         self._middle = torch.from_numpy(middle.astype(np.float32)).to(data.device)
         self._inner = 0.5 * radius
 
@@ -46,7 +46,7 @@ class Skybox(Effect):
         return torch.linalg.vector_norm(means - self._middle, dim=1) > self._inner
 
     def first_points(self, data: TrainData, most: int) -> tuple[np.ndarray, np.ndarray]:
-        middle, radius = sphere_of(data.cameras, data.scene.points.xyz)
+        middle, radius = skybox_sphere(data.cameras, data.scene.points.xyz)
         views = range(0, len(data.photos), -(-len(data.photos) // PHOTOS))
         count, self.count = COUNT, 0
         while count >= MIN_SPHERE_POINTS:
@@ -63,7 +63,7 @@ class Skybox(Effect):
         return {"points": self.count}
 
 
-def sphere_of(cameras: list[Camera], xyz: np.ndarray) -> tuple[np.ndarray, float]:
+def skybox_sphere(cameras: list[Camera], xyz: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the middle [3] and the radius of the skybox in the world.
 
     Args:

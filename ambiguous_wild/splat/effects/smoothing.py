@@ -44,7 +44,7 @@ class SmoothingFilter(Effect):
             size = filter_sizes(gaussians.means, self.cameras)
             if not context.neutral and not context.other_gaussians:  # a probe must not change the state
                 self.size, self._at, self._stale = size, context.iteration, False
-        wide, share = widened(gaussians.log_scales, size)
+        wide, share = filtered_variances(gaussians.log_scales, size)
         plain = torch.sigmoid(gaussians.opacity_logits)
         opacity = plain * share.prod(dim=1).sqrt()
         # the logit of an opaque Gaussian that is not widened would be infinite
@@ -75,7 +75,7 @@ class SmoothingFilter(Effect):
         self._at, self._stale = int(state["at"]), bool(state["stale"])
 
 
-def widened(log_scales: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+def filtered_variances(log_scales: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
     """Return s^2 + f^2 [N, 3] under a filter of size f [N], and s^2 as a share of it."""
     variance = (2 * log_scales).exp()
     wide = variance + size.to(variance)[:, None] ** 2

@@ -33,7 +33,7 @@ class TrackColours:
         return TrackColours(self.point[rows], self.view[rows], self.rgb[rows])
 
 
-def tracks_of(scene: Scene) -> list[np.ndarray]:
+def point_indices_by_photo(scene: Scene) -> list[np.ndarray]:
     """Return for each train photo the sorted indices of its sparse points."""
     points, owner = scene.points, scene.points.owners
     order = np.argsort(points.track_views, kind="stable")

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from ambiguous_wild.core import Camera
-from ambiguous_wild.methods.refinesplat.mask_prior import FirstLookConfig, initial_mask_prior
+from ambiguous_wild.methods.refinesplat.mask_prior import InitialMaskPriorConfig, initial_mask_prior
 from ambiguous_wild.vision.sparse_surface import static_surfaces
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 VIEWS, DEPTH = 7, 4.0
-JUDGE_ALL = FirstLookConfig(least=0.0)
+JUDGE_ALL = InitialMaskPriorConfig(least=0.0)
 
 
 def camera(view: int) -> Camera:
@@ -70,15 +70,15 @@ def test_what_no_other_photo_shows_waits_and_the_wall_does_not():
 
 def test_a_wall_alone_counts_whole():
     photos = [wall(view) for view in range(VIEWS)]
-    assert keeps(photos, FirstLookConfig()) == [None] * VIEWS
+    assert keeps(photos, InitialMaskPriorConfig()) == [None] * VIEWS
     assert all(keep.all() for keep in keeps(photos, JUDGE_ALL))
 
 
 def test_a_start_can_bear_a_little():
     photos, masks = passers()
     share = float(np.mean(masks))
-    assert all(keep is not None for keep in keeps(photos, FirstLookConfig(least=0.6 * share)))
-    assert keeps(photos, FirstLookConfig(least=1.5 * share)) == [None] * VIEWS
+    assert all(keep is not None for keep in keeps(photos, InitialMaskPriorConfig(least=0.6 * share)))
+    assert keeps(photos, InitialMaskPriorConfig(least=1.5 * share)) == [None] * VIEWS
 
 
 def test_a_photo_of_other_exposure_is_not_left_out():

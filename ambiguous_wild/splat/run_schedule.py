@@ -1,4 +1,4 @@
-"""What a run does when: its progress, the next view, and the resolution and learning rates of each step.
+"""Schedules of a run: its progress, the next view, resolution and learning rates of each step.
 
 How small the training photos may be at each point of a short run is DashGaussian's rule (arXiv 2503.18402):
 the resolution follows the share of the photos' spectrum that has been learnt. It reads the frequencies of the
@@ -27,17 +27,17 @@ SMALLEST_SIDE = 96  # px; smaller photos are too small for SSIM's 11-tap window 
 
 
 @dataclass(frozen=True)
-class Level:
+class ResolutionLevel:
     """From `begin` (share of the run) on, photos are trained at 1/`factor` of their width and height."""
 
     begin: float
     factor: int
 
 
-FULL = (Level(0.0, 1),)
+FULL_RESOLUTION = (ResolutionLevel(0.0, 1),)
 
 
-def coarse_to_fine(photos: list[np.ndarray]) -> tuple[Level, ...]:
+def coarse_to_fine(photos: list[np.ndarray]) -> tuple[ResolutionLevel, ...]:
     """Choose when the downsampling factors 4, 2 and 1 begin, from the photos' mean spectrum.
 
     Args:
@@ -49,23 +49,23 @@ def coarse_to_fine(photos: list[np.ndarray]) -> tuple[Level, ...]:
     side = min(min(photo.shape[:2]) for photo in photos)
     factors = [d for d in (4, 2, 1) if side // d >= SMALLEST_SIDE] or [1]
     if factors == [1]:
-        return FULL
+        return FULL_RESOLUTION
     energies = {d: float(np.mean([_spectrum_share(photo, d) for photo in photos])) for d in factors}
     start = energies[factors[0]]
     total = energies[1]
     if not 0.0 < start < total:
-        return FULL  # flat photos carry no frequencies to wait for
-    levels = [Level(0.0, factors[0])]
+        return FULL_RESOLUTION  # flat photos carry no frequencies to wait for
+    levels = [ResolutionLevel(0.0, factors[0])]
     for previous, factor in itertools.pairwise(factors):
         # COARSE_UNTIL ln(E / E_min) / ln(E_total / E_min) as in Dash, but the mean of the level that ends and
         # of the one that begins
         share = np.log(energies[factor] / start) / np.log(total / start)
         before = np.log(energies[previous] / start) / np.log(total / start)
-        levels.append(Level(float(COARSE_UNTIL * (before + share) / 2), factor))
+        levels.append(ResolutionLevel(float(COARSE_UNTIL * (before + share) / 2), factor))
     return tuple(levels)
 
 
-def factor_at(levels: tuple[Level, ...], progress: float) -> int:
+def downsampling_at(levels: tuple[ResolutionLevel, ...], progress: float) -> int:
     """Return the downsampling factor at this share of the run."""
     current = levels[0].factor
     for level in levels:
@@ -74,7 +74,7 @@ def factor_at(levels: tuple[Level, ...], progress: float) -> int:
     return current
 
 
-def ceiling_at(start: int, most: int, factor: int, progress: float) -> int:
+def growth_cap_at(start: int, most: int, factor: int, progress: float) -> int:
     """Return how many Gaussians the current resolution can use (Dash's count schedule).
 
     This is N0 + (Nmax - N0) / r^(2 - progress / COARSE_UNTIL); at full resolution Nmax.
@@ -94,7 +94,7 @@ def _spectrum_share(photo: np.ndarray, factor: int) -> float:
     return float(spectrum[height // 2 - h : height // 2 + h, width // 2 - w : width // 2 + w].sum())
 
 
-def cap(
+def max_gaussians(
     config: TrainConfig, schedule: Schedule, sizes: Sequence[tuple[int, int]], most: int, start: int = 0
 ) -> int:
     """Gaussians that a run may have, on photos of these sizes (height, width); `most` is the method's own."""
@@ -106,7 +106,7 @@ def cap(
     return min(most, max(start, int(pixels)))
 
 
-class Pace:
+class RunSchedule:
     """Every schedule of one run, computed from its settings and progress: it has no state to save."""
 
     def __init__(
@@ -127,7 +127,7 @@ class Pace:
         self._order: tuple[int, np.ndarray] | None = None
         self.start = start
         self.short = config.budget_s is not None or config.iterations < schedule.short_below
-        self.most = self._most(data, most)
+        self.max_gaussians = self._max_gaussians(data, most)
         self.levels = self._levels(data)
 
     def marks(self, count: int, iteration: int, elapsed_s: float) -> int:
@@ -138,16 +138,16 @@ class Pace:
 
     def downsampling(self, progress: float) -> int:
         """Return the downsampling factor at this share of the run."""
-        return factor_at(self.levels, progress)
+        return downsampling_at(self.levels, progress)
 
     @property
     def factors(self) -> tuple[int, ...]:
         """Every downsampling factor that the run uses."""
         return tuple(sorted({level.factor for level in self.levels}))
 
-    def ceiling(self, factor: int, progress: float) -> int:
+    def growth_cap(self, factor: int, progress: float) -> int:
         """Return the number of Gaussians at which growth stops now."""
-        return ceiling_at(self.start, self.most, factor, progress)
+        return growth_cap_at(self.start, self.max_gaussians, factor, progress)
 
     def learning_rates(self, progress: float) -> dict[str, float]:
         """Return the learning rate of every tensor at this share of the run."""
@@ -174,20 +174,20 @@ class Pace:
             self._order = epoch, rng.permutation(self.views)
         return int(self._order[1][(iteration - 1) % self.views])
 
-    def _most(self, data: TrainData, most: int) -> int:
+    def _max_gaussians(self, data: TrainData, most: int) -> int:
         """Return the number of Gaussians at which growth ends; in short runs it follows the photos' pixels.
 
         Simulated courtyard at 240x135, 3000 iterations: 14 000, 20 000, 32 000 and 64 000 Gaussians gave
         RefineSplat 30.3, 31.1, 31.3 and 30.7 dB at 9.5, 11.3, 13.6 and 19.6 ms an iteration.
         """
         sizes = [(camera.height, camera.width) for camera in data.cameras]
-        return cap(self.config, self.schedule, sizes, most, self.start)
+        return max_gaussians(self.config, self.schedule, sizes, most, self.start)
 
-    def _levels(self, data: TrainData) -> tuple[Level, ...]:
+    def _levels(self, data: TrainData) -> tuple[ResolutionLevel, ...]:
         resolution: str = self.config.resolution
         if resolution == "auto":
             resolution = "coarse-to-fine" if self.config.budget_s is not None else self.schedule.resolution
         if resolution == "full":
-            return FULL
+            return FULL_RESOLUTION
         sample = data.photos[:: max(len(data.photos) // 8, 1)]
         return coarse_to_fine([photo.cpu().numpy() for photo in sample])

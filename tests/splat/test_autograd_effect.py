@@ -10,7 +10,13 @@ import torch
 from ambiguous_wild.core import AwError
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.density import DensityConfig
-from ambiguous_wild.splat.effects.autograd_effect import Leaf, Learnt, Visible, mlp, mlp_leaves
+from ambiguous_wild.splat.effects.autograd_effect import (
+    AutogradEffect,
+    Leaf,
+    VisibleGaussians,
+    mlp,
+    mlp_leaves,
+)
 from ambiguous_wild.splat.effects.base import rate_for_run_length
 from ambiguous_wild.splat.effects.effect_pipeline import FIT_STEPS, EffectPipeline
 from ambiguous_wild.splat.field import GaussianAttribute
@@ -22,7 +28,7 @@ from tests.splat.scenes import camera, gaussians
 from tests.splat.scenes import trainer_for as trainer_of
 
 
-class Everything(Learnt):
+class Everything(AutogradEffect):
     """Acts in all three places: colours per photo and Gaussian, opacities per photo, a tone."""
 
     name = "everything"
@@ -39,7 +45,7 @@ class Everything(Learnt):
     def rows(self, gaussians):
         return {"code": GaussianAttribute(0.1 * torch.ones(len(gaussians), 3), rate=0.01)}
 
-    def forward(self, visible: Visible, leaf: Mapping[str, torch.Tensor], context: ViewContext):
+    def forward(self, visible: VisibleGaussians, leaf: Mapping[str, torch.Tensor], context: ViewContext):
         inputs = torch.cat([visible.base, visible.attributes["code"] * leaf["tint"]], dim=1)
         return visible.base * (1 + leaf["tint"]) + 0.1 * mlp(inputs, leaf, "net") + 0.01 * visible.means
 
@@ -75,7 +81,9 @@ def test_all_three_places_against_finite_differences(scene, tmp_path):
     effect.setup(data)
     g = gaussians(4, n=25, size=-0.5)
     g.opacity_logits.clamp_(-1.5, 1.5)
-    g = g.carrying({"code": torch.tensor(np.random.default_rng(1).normal(size=(25, 3)), dtype=torch.float32)})
+    g = g.with_attributes(
+        {"code": torch.tensor(np.random.default_rng(1).normal(size=(25, 3)), dtype=torch.float32)}
+    )
     weight = torch.tensor(np.random.default_rng(2).normal(size=(29, 37, 3)), dtype=torch.float32)
     rendered = drawn_with(effect, g)
     found = rendered.backward(weight)
@@ -131,7 +139,7 @@ def test_a_photo_that_was_not_trained_on(scene, tmp_path):
     assert all(torch.equal(tensor, before[name]) for name, tensor in trainer.gaussians.named_tensors())
 
 
-class Gains(Learnt):
+class Gains(AutogradEffect):
     """A gain per photo; with `redraw` it also acts on the Gaussians' colours, without changing them."""
 
     name = "gains"

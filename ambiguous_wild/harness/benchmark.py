@@ -209,10 +209,11 @@ def bench(
     engine = Engine() if engine is None else engine
     engine = engine if jobs is None else dataclasses.replace(engine, jobs=jobs)
     engine.check()
-    if engine.transfer == "store" and (overwrite == "longer" or corrections is not None):
+    unsent = {"--overwrite longer": overwrite == "longer", "--corrections": corrections, "--start": start}
+    if engine.transfer == "store" and any(unsent.values()):
         raise AwError(
-            "--overwrite longer and --corrections need files that --set engine.transfer=store does not send: "
-            "leave it out, with -o on storage that all nodes share"
+            f"{next(option for option, given in unsent.items() if given)} needs a file that --set "
+            "engine.transfer=store does not send: leave it out, with -o on storage that all nodes share"
         )
     metrics = [metrics] if isinstance(metrics, str | Path) else metrics
     for file in metrics:

@@ -244,6 +244,10 @@ def test_a_scene_travels_and_a_run_folder_comes_back(scene, tmp_path, monkeypatc
             ["--engine", "ray", "--set", "engine.transfer=store", "--overwrite", "longer"], "does not send",
             marks=NEEDS_RAY,
         ),
+        pytest.param(
+            ["--engine", "ray", "--set", "engine.transfer=store", "--start", __file__],
+            "--start needs a file that", marks=NEEDS_RAY,
+        ),
     ],
 )  # fmt: skip
 def test_what_does_not_go_together_is_refused(scene, tmp_path, words, message):

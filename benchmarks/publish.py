@@ -9,7 +9,8 @@ drew around it (movers.json, px of the file): in train photos for the scores of 
 PSNR leaves it out (`psnr_valid`). --data holds a folder of photos for each, and cutouts/; without it only the
 suite is made. --methods all: every method of `aw methods`. All methods of a scene train with the effects of
 its plan.
-Checked runs go to the board, leaderboard/measured; then `python benchmarks/figures.py` writes the tables.
+Checked runs go to the board, leaderboard/measured, then `python benchmarks/figures.py` writes the tables; the
+table of photos with polygons goes to results/movers.md.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from job_queue import Run, aw, count, exit_code, run_all, seed
+from job_queue import Run, aw, count, exit_code, run_all, seed, write_section
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.suites import MEASURED as FACTS
@@ -45,6 +46,8 @@ SUITE = get_suite("aw-sim")
 BASES = {"seneca": 4, "monstree": 4, "sceaux": 4, "tiny_aerial": 2}  # downsampling to 240 px and more
 KINDS = ("cutouts", "patches")
 MOVERS = ROOT / "benchmarks" / "movers.json"  # capture: photo: polygons [[x, y], ...]
+DRAWN_RESULTS = ROOT / "benchmarks" / "results" / "movers.md"
+DRAWN_METRICS = ("psnr_valid", "mask_iou", "mask_precision", "mask_recall")
 DRAWN = {"train": 2, "statue": 2, "reichstag": 4}  # captures of MOVERS: downsampling
 METHODS = ("3dgs", "dronesplat", "robustsplat", "refinesplat", "3dgs+truth")
 LENGTH = 1000  # iterations
@@ -148,6 +151,14 @@ def runs_of(scene: Path, args: argparse.Namespace) -> Iterator[Run]:
             yield Run(f"{method} on {scene.name}, seed {number}", folder, method, words, own)
 
 
+def write_drawn(names: Sequence[str], args: argparse.Namespace) -> None:
+    """Write the table of captures with polygons: no board takes test photos with distractors."""
+    words = [word for metric in DRAWN_METRICS for word in ("--metric", metric)]
+    table = aw("table", *(str(args.runs / name) for name in names), *words, "--format", "markdown")
+    lines = [line for line in table.splitlines() if not line.startswith("- command: ")]
+    write_section(DRAWN_RESULTS, " ".join([f"{args.iterations} iterations", *args.set]), "\n".join(lines))
+
+
 def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--work", type=Path, required=True, help="captures, scenes and runs")
@@ -177,7 +188,9 @@ def main(words: Sequence[str] | None = None) -> int:
     record_ambiguity(scenes, args.work)
     scenes |= {name: real[name].build(args.work) for name in chosen if name in real}
     failed = run_all([run for scene in scenes.values() for run in runs_of(scene, args)], args.jobs)
-    for name in scenes:
+    if drawn := [name for name in scenes if name in DRAWN]:
+        write_drawn(drawn, args)
+    for name in (name for name in scenes if name not in DRAWN):
         # photos of --data may not be passed on
         dataset, images = (real[name].dataset, "0") if name in real else (SUITE.dataset, "1")
         add = ("leaderboard", "add", str(args.runs / name), "--board", str(args.board))

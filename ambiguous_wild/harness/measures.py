@@ -32,6 +32,8 @@ Better = Literal["higher", "lower", None]  # None: not ranked
 _IMAGE = "ambiguous_wild.metrics.image:"
 BYTES_A_CODE = 80  # of a picture, while a metric works on it: ten copies in float64
 _REGION_DB = 1e-2  # larger, because rounding may move a pixel into or out of a region
+# metrics that do not count distractors in test photos: the pixels that they measure
+STATIC_PIXELS = {"psnr_consistent": "other photos show alike", "psnr_valid": "the masks of test photos keep"}
 MASK_LABELS = {"iou": "IoU", "precision": "precision", "recall": "recall"}
 ALWAYS = ("psnr", "ssim", "lpips_alex")  # shown even where missing: the reason stands below the table
 COST = ("train_s", "reference_s", "ms_per_iteration", "fps", "gaussians", "model_mb")
@@ -54,7 +56,7 @@ class Measure:
     @property
     def whole_photo(self) -> bool:
         """True if a distractor in a test photo counts as truth."""
-        return self.per_image and self.key not in ("psnr_consistent", "psnr_valid")
+        return self.per_image and self.key not in STATIC_PIXELS
 
     @property
     def quality(self) -> bool:

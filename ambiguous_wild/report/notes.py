@@ -14,7 +14,7 @@ from ambiguous_wild.core.config import flatten
 from ambiguous_wild.core.errors import counted, shortlist
 from ambiguous_wild.core.grouping import grouped
 from ambiguous_wild.harness.labels import IN_FOLDER
-from ambiguous_wild.harness.measures import Measure, measure
+from ambiguous_wild.harness.measures import STATIC_PIXELS, Measure, measure
 from ambiguous_wild.harness.result_file import NOT_BEGUN, Options
 from ambiguous_wild.harness.store import Runs, config_section, read_config
 from ambiguous_wild.methods.graft import members
@@ -105,8 +105,10 @@ def mixed_scenes(frame: pd.DataFrame) -> frozenset[str]:
 def _mixed(frame: pd.DataFrame, columns: Sequence[Measure]) -> list[str]:
     """Return a line for each reason to doubt test photos, with the scenes, and what is ranked instead."""
     rows = frame[(frame["status"] == "ok") & (frame["test_photos"] != "")]
-    ranked = [c.label for c in columns if c.per_image and not c.whole_photo]
-    instead = f"ranked is {' and '.join(ranked)}, over pixels that other photos show alike" if ranked else ""
+    ranked = [
+        f"{c.label}, over pixels that {STATIC_PIXELS[c.key]}" for c in columns if c.key in STATIC_PIXELS
+    ]
+    instead = f"ranked is {'; and '.join(ranked)}" if ranked else ""
     why = f"{DOUBTFUL} is not ranked, as a model that draws distractors gains by it"
     return [
         f"{reason} ({shortlist(sorted(set(of['scene'])))}): {'; '.join(filter(None, (why, instead)))}"

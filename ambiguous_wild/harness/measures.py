@@ -33,7 +33,7 @@ _IMAGE = "ambiguous_wild.metrics.image:"
 BYTES_A_CODE = 80  # of a picture, while a metric works on it: ten copies in float64
 _REGION_DB = 1e-2  # larger, because rounding may move a pixel into or out of a region
 # metrics that do not count distractors in test photos: the pixels that they measure
-STATIC_PIXELS = {"psnr_consistent": "other photos show alike", "psnr_valid": "the masks of test photos keep"}
+STATIC_PIXELS = {"psnr_valid": "the masks of test photos keep", "psnr_consistent": "other photos show alike"}
 MASK_LABELS = {"iou": "IoU", "precision": "precision", "recall": "recall"}
 ALWAYS = ("psnr", "ssim", "lpips_alex")  # shown even where missing: the reason stands below the table
 COST = ("train_s", "reference_s", "ms_per_iteration", "fps", "gaussians", "model_mb")

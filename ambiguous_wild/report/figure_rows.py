@@ -1,7 +1,7 @@
 """What a figure of runs shows: its photos, its zooms and its pictures, equal for all methods.
 
 What is not given is found by one rule: where the mean squared errors of the methods differ most. Which method
-is better does not enter.
+is better does not enter. Where test photos may hold distractors, only static pixels are measured.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ import numpy as np
 from ambiguous_wild.core import AwError, Scene, View
 from ambiguous_wild.core.errors import shortlist, unknown
 from ambiguous_wild.core.scene import find_view
+from ambiguous_wild.harness.measures import STATIC_PIXELS
 from ambiguous_wild.harness.result_file import (
     RESTORE,
     RESULT,
@@ -54,6 +56,7 @@ class FigureRow:
     errors: tuple[
         np.ndarray, ...
     ] = ()  # for each method [H, W] float32: |render - photo|, mean over channels
+    pixels: np.ndarray | None = None  # [H, W] bool, those that are measured; None: all
 
 
 @dataclass(frozen=True)
@@ -79,11 +82,41 @@ class _SceneRuns:
     results: tuple[RunResult, ...]
     methods: tuple[str, ...]  # as they are shown
 
+    @cached_property
+    def doubt(self) -> str:
+        """Why test photos may hold distractors; empty if they hold none."""
+        return next(filter(None, (str(r["facts"].get("test_photos", "")) for r in self.results)), "")
+
+    @cached_property
+    def metric(self) -> str:
+        """The metric below renders: that of static pixels, where test photos may hold distractors."""
+        measured = [
+            {key for row in result["per_image"] for key in metrics_of(row)} for result in self.results
+        ]
+        static = (key for key in STATIC_PIXELS if all(key in keys for keys in measured))
+        return next(static, "psnr") if self.doubt else "psnr"
+
     def psnr(self, k: int, view: View) -> float:
-        """Return the PSNR in dB that run k was measured to have; NaN where it has none."""
+        """Return the value in dB of `metric` that run k was measured to have; NaN where it has none."""
         rows = {row["name"]: metrics_of(row) for row in self.results[k]["per_image"]}
-        value = rows.get(view.name, {}).get("psnr")
+        value = rows.get(view.name, {}).get(self.metric)
         return math.nan if value is None else float(value)
+
+    def pixels(self, view: View) -> np.ndarray | None:
+        """Return the pixels of a test photo that `metric` measures, [H, W] bool; None: all."""
+        if self.metric == "psnr":
+            return None
+        from ambiguous_wild.harness.regions import find_regions  # imports torch
+
+        return find_regions(self.scene).pixels[self.metric].get(view.name)
+
+    def notes(self) -> list[str]:
+        """Return what the PSNR of doubtful test photos is of."""
+        if not self.doubt:
+            return []
+        if self.metric == "psnr":
+            return [f"scene {self.scene.name}: {self.doubt}"]
+        return [f"scene {self.scene.name}: dB over the pixels that {STATIC_PIXELS[self.metric]}"]
 
     def renders(self, view: View) -> list[np.ndarray]:
         paths = [check_render(run, result, view.name) for run, result in zip(self.folders, self.results)]
@@ -149,6 +182,7 @@ def runs_figure(
             masked = _most_masked(group)[:count]
             rows += [_row(group, view, None, find=False, errors=False) for view in masked]
             notes += [] if masked else [f"scene {group.scene.name}: no method has masks"]
+        notes += group.notes()
     for name in photos:
         if not any(_view(group.scene, name) for group in groups):
             raise unknown("photo", name, [view.name for group in groups for view in group.scene.views])
@@ -247,11 +281,13 @@ def _row(group: _SceneRuns, view: View, box: Box | None, *, find: bool, errors: 
     renders = group.renders(view)
     values = [group.psnr(k, view) for k in range(len(renders))]
     texts = ["no PSNR" if math.isnan(value) else f"{value:.2f} dB" for value in values]
+    pixels = group.pixels(view)
     if find:
         squared = [_difference(render, photo, 2) for render in renders]
+        squared = squared if pixels is None else [error * pixels for error in squared]
         box = most_different_box(squared, group.first_column(view))
     maps = tuple(_difference(render, photo, 1) for render in renders) if errors else ()
-    return FigureRow(group.scene.name, view.name, False, (photo, *renders), ("", *texts), box, maps)
+    return FigureRow(group.scene.name, view.name, False, (photo, *renders), ("", *texts), box, maps, pixels)
 
 
 def _difference(render: np.ndarray, photo: np.ndarray, power: int) -> np.ndarray:
@@ -298,10 +334,11 @@ def in_words(figure: RunsFigure) -> list[str]:
             line += f" --crop {','.join(map(str, row.box))}"
         if row.box is not None and not row.masks:
             photo, *renders = (cut(picture, row.box) for picture in row.pictures)
-            inside = [psnr_from_mse(float(_difference(r, photo, 2).mean(dtype=np.float64))) for r in renders]
-            line += ", inside: " + ", ".join(
-                f"{method} {value:.2f} dB" for method, value in zip(figure.methods, inside)
-            )
+            pixels = np.ones(photo.shape[:2], bool) if row.pixels is None else cut(row.pixels, row.box)
+            if pixels.any():
+                errors = (_difference(r, photo, 2)[pixels].mean(dtype=np.float64) for r in renders)
+                inside = zip(figure.methods, (psnr_from_mse(float(error)) for error in errors))
+                line += ", inside: " + ", ".join(f"{method} {value:.2f} dB" for method, value in inside)
         lines.append(line)
     return [*lines, *figure.notes]
 

@@ -85,6 +85,31 @@ def test_photo_and_zoom_are_where_methods_differ_most(runs: Path) -> None:
     )
 
 
+def test_distractors_in_test_photos_count_neither_for_the_figure_nor_for_its_numbers(tmp_path: Path) -> None:
+    """Where 3dgs is wrong, the test photo's mask says that a distractor is."""
+    scene, keep = own_scene(tmp_path / "porch"), np.full((HEIGHT, WIDTH), 255, np.uint8)
+    left, top, wide, high = SPOT
+    keep[top : top + high, left : left + wide] = 0
+    write_png(scene / "masks" / "test" / "test_1.png", keep)
+
+    def mixed(result: dict) -> None:
+        result["facts"]["test_photos"] = "every 8th photo tests"
+        for row in result["per_image"]:
+            row["psnr_valid"] = 31.5
+
+    for method in METHODS:
+        run = write_run(tmp_path / method, scene, method, noise=5.0)
+        if method == "3dgs":
+            spoil(run, "test_1.png", SPOT)
+        change_result(run, mixed)
+    figure = of(tmp_path, photos=["test_1.png"])
+    (row,) = figure.rows
+    assert row.texts == ("", *["31.50 dB"] * 3) and row.box != SPOT
+    assert figure.notes == ("scene porch: dB over the pixels that the masks of test photos keep",)
+    (row,) = of(tmp_path, photos=["test_1.png"], crops=[SPOT]).rows
+    assert "inside" not in in_words(replace(figure, rows=(row,)))[0]  # no pixel there is measured
+
+
 def test_the_box_is_that_of_an_exhaustive_search() -> None:
     rng = np.random.default_rng(3)
     errors = [rng.random((34, 41)).astype(np.float32) for _ in range(3)]

@@ -163,7 +163,7 @@ def retrieval_pairs(
     return [(names[a], names[b]) for a, b in sorted(pairs)]
 
 
-def test_set_pairs(
+def pairs_of_test_set(
     vectors: np.ndarray,  # [N, D]
     names: Sequence[str],
     test_names: set[str],
@@ -180,7 +180,7 @@ def sequential_pairs(names: list[str], test_names: set[str]) -> list[tuple[str, 
     """Pair neighbours in the given order, and photos 2^k further on.
 
     Photos of a separate test set are not part of the walk: their neighbours by name are other test photos.
-    `test_set_pairs` finds theirs.
+    `pairs_of_test_set` finds theirs.
 
     Args:
         names: photos in the order of capture.

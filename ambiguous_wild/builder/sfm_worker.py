@@ -36,7 +36,7 @@ from ambiguous_wild.builder.retrieval import (
     RELATIVE_POSES,
     retrieval_pairs,
     sequential_pairs,
-    test_set_pairs,
+    pairs_of_test_set,
     vlad_vectors,
 )
 from ambiguous_wild.builder.sfm import (
@@ -284,7 +284,7 @@ def _likely_pairs(job: MatchJob) -> list[tuple[str, str]]:
 
         if sequential:
             vectors = vlad_vectors(read, job["names"], job["seed"])
-            pairs = {*sequential_pairs(job["names"], tests), *test_set_pairs(vectors, job["names"], tests)}
+            pairs = {*sequential_pairs(job["names"], tests), *pairs_of_test_set(vectors, job["names"], tests)}
             return sorted(pairs)
         return retrieval_pairs(
             read,

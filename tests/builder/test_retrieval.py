@@ -12,7 +12,7 @@ from ambiguous_wild.builder.retrieval import (
     most_similar,
     retrieval_pairs,
     shared_features,
-    test_set_pairs,
+    pairs_of_test_set,
     vlad_vectors,
 )
 from tests.builder.capture_maker import COUNT, SETTINGS
@@ -49,7 +49,7 @@ def test_the_number_of_pairs_is_linear():
     assert len(pairs) == len({frozenset(p) for p in pairs})
     assert ("p001", "p002") in pairs and all(a != b for a, b in pairs)
     vectors = vlad_vectors(photos.__getitem__, names)
-    of_tests = test_set_pairs(vectors, names, tests)
+    of_tests = pairs_of_test_set(vectors, names, tests)
     assert len(of_tests) <= len(tests) * (2 * SIMILAR + SIMILAR // 2)
     assert all(a in tests or b in tests for a, b in of_tests)
     assert {n for p in of_tests for n in p} >= tests

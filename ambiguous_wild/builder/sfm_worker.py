@@ -34,9 +34,9 @@ from ambiguous_wild.builder.records import FixedMask
 from ambiguous_wild.builder.retrieval import (
     PAIRS,
     RELATIVE_POSES,
+    pairs_of_test_set,
     retrieval_pairs,
     sequential_pairs,
-    pairs_of_test_set,
     vlad_vectors,
 )
 from ambiguous_wild.builder.sfm import (

@@ -10,9 +10,9 @@ from ambiguous_wild.builder.retrieval import (
     SIMILAR,
     best_pairs,
     most_similar,
+    pairs_of_test_set,
     retrieval_pairs,
     shared_features,
-    pairs_of_test_set,
     vlad_vectors,
 )
 from tests.builder.capture_maker import COUNT, SETTINGS

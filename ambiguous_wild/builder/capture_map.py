@@ -122,7 +122,7 @@ def map_of_model(
     up = -poses[:, 1, :3].mean(axis=0)
     hidden = np.linalg.norm(up) > UPRIGHT and np.cross(*plane) @ up < np.linalg.norm(up) / 2
     direction = "seen in the viewing direction" if hidden else "seen from above"
-    result = CaptureMap(f"{len(names)} of {len(sources)} photos placed, {direction}", photos, [], [], [])
+    result = CaptureMap(f"{len(names)} of {len(sources)} photos registered, {direction}", photos, [], [], [])
     result = _with_links(result, links)
     for component in other_components:
         members = sorted(order[name] for name in component if name in order)
@@ -163,7 +163,7 @@ def map_of_photos(
     ]
     whole = len(main) == len(sources)
     share = f"all {len(main)}" if whole else f"about {len(main)} of {len(sources)}"
-    title = f"{share} photos will be placed; near = much overlap, not positions"
+    title = f"{share} photos will be registered; near = much overlap, not positions"
     result = _with_links(CaptureMap(title, photos, [], [], [], posed=False), links)
     matches = {link[:2]: link[2] for link in links}
     bridged = [

@@ -227,18 +227,18 @@ def overlap(
     growth: GrowthForecast,
     gaps: Sequence[tuple[int, int]],  # of `component_gaps`
 ) -> CaptureCheck:
-    """Predict how many photos will be placed, and name those that share too little with the others."""
+    """Predict how many photos will be registered, and name those that share too little with the others."""
     names, count = [photo.source for photo in photos], len(photos)
     if not growth.components:
-        finding = "no three photos share enough features: none will be placed" + _few_pairs(compared)
+        finding = "no three photos share enough features: none will be registered" + _few_pairs(compared)
         advice = "take more photos, each sharing two thirds of the picture with the next"
         return CaptureCheck("overlap", "warning", "pixels", finding, advice, tuple(names))
     main = growth.components[0]
     if len(main) == count:
         median = float(np.median(compared.covisible))
-        finding = f"each overlaps with {median:.0f} others (median); all {count} photos will be placed"
+        finding = f"each overlaps with {median:.0f} others (median); all {count} photos will be registered"
         return CaptureCheck("overlap", "ok", "pixels", finding)
-    finding = f"about {len(main)} of {count} photos will be placed"
+    finding = f"about {len(main)} of {count} photos will be registered"
     if len(growth.components) > 1:
         finding += f"; parts: {', '.join(str(len(component)) for component in growth.components)}"
     if growth.others:

@@ -90,10 +90,10 @@ def check_registered(
         return
     facts = pair_facts(database, matches)
     unread = f", {skipped} were left out" if skipped else ""
-    placed = f"{registered} of {photos} photos" + f" with {points} points" * few
+    outcome = f"{registered} of {photos} photos" + f" with {points} points" * few
     wanted = f"{needed}" + f" and {MIN_POINTS} points a photo" * few
     raise AwError(
-        f"structure from motion placed {placed}{unread}; a scene needs {wanted}: "
+        f"structure from motion registered {outcome}{unread}; a scene needs {wanted}: "
         f"{facts.sentence()}; likely {facts.reason(photos)}" + "".join(f"; {remark}" for remark in remarks)
     )
 

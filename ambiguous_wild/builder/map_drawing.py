@@ -304,7 +304,7 @@ def _draw_panel(axes: Any, drawn: CaptureMap) -> None:
         top -= 1.25 * line
     for heading, sentences, most in (
         ("Take more photos (star)" if drawn.stars else "Take more photos", drawn.advice, MAX_ADVICE),
-        ("Not placed", drawn.listed, MAX_LISTED),
+        ("Not registered", drawn.listed, MAX_LISTED),
     ):
         if not sentences:
             continue
@@ -342,7 +342,7 @@ def _legend(drawn: CaptureMap) -> Iterator[tuple[str, str]]:
     """Yield what the map holds: kind of a symbol, and its meaning."""
     kinds = {photo.kind for photo in drawn.photos}
     if "train" in kinds:
-        yield "train", "train photo" if drawn.posed else "will be placed"
+        yield "train", "train photo" if drawn.posed else "will be registered"
     if "test" in kinds:
         yield "test", "test photo"
     if any(photo.heading for photo in drawn.photos):
@@ -350,11 +350,11 @@ def _legend(drawn: CaptureMap) -> Iterator[tuple[str, str]]:
     if "component" in kinds:
         yield "component", "another part"
     if any(photo.provisional for photo in drawn.photos):
-        yield "provisional", "placed with little evidence"
+        yield "provisional", "registered with little evidence"
     if any(photo.kind == "left out" and not photo.unsure for photo in drawn.photos):
-        yield "left out", "not placed" if drawn.posed else "will not be placed"
+        yield "left out", "not registered" if drawn.posed else "will not be registered"
     if any(photo.unsure for photo in drawn.photos):
-        yield "?", "not placed, drawn beside its best match"
+        yield "?", "not registered, drawn beside its best match"
     if any(photo.weak for photo in drawn.photos):
         yield "weak photo", "overlaps with fewer than three photos"
     if any(link.kind == "strong" for link in drawn.links):

@@ -46,14 +46,14 @@ class PoseHypothesis:
 def rejection_reason(best: PoseHypothesis, competing: PoseHypothesis, needed: int) -> str | None:
     """Return why the best hypothesis is not accepted; None if it is."""
     if not best.support:
-        return "no placed photo agrees with it on a pose"
+        return "no registered photo agrees with it on a pose"
     if len(best.support) == 1 < needed:
-        return "only one placed photo agrees with it on a pose"
+        return "only one registered photo agrees with it on a pose"
     if len(best.support) < needed:
-        return f"only {len(best.support)} placed photos agree with it on a pose"
+        return f"only {len(best.support)} registered photos agree with it on a pose"
     if best.area < MIN_AREA or (best.area < AREA_NEW and best.coverage < MIN_COVERAGE):
         part = f"{best.area:.0%}, coverage {best.coverage:.2f}"
-        return f"only a small part of it agrees with {len(best.support)} placed photos ({part})"
+        return f"only a small part of it agrees with {len(best.support)} registered photos ({part})"
     if len(competing.support) >= MIN_SUPPORT and competing.weight > COMPETING_WEIGHT * best.weight:
         return f"{TWO_POSES}: {len(best.support)} photos agree on one, {len(competing.support)} on another"
     return None

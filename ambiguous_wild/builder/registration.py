@@ -107,7 +107,7 @@ class Registration:
                 self.provisional |= smaller
         for photo in range(len(times_out)):
             if photo not in self.poses:
-                self.left_out.setdefault(photo, "too few placed photos agree with it in the end")
+                self.left_out.setdefault(photo, "too few registered photos agree with it in the end")
 
     def accept_all(self) -> None:
         """Accept the poses of the model as they are, with the photos that support each."""

@@ -220,7 +220,7 @@ def summary_lines(info: SceneRecord, *, test_advice: bool = True) -> list[str]:
     lines = [f"{counts['train']} training and {counts['test']} test photos (split: {info['split']})"]
     if info["lost"]:
         reasons = shortlist([f"{p['source']} ({p['reason']})" for p in info["lost"]], 4)
-        lines.append(f"{len(info['lost'])} not placed: {reasons}")
+        lines.append(f"{len(info['lost'])} not registered: {reasons}")
     lines += fixed_lines(info["fixed_to_camera"])
     return lines + [f"warning: {w}" for w in info["warnings"] if test_advice or not w.startswith(NO_TEST_SET)]
 
@@ -333,7 +333,7 @@ def provisional_warnings(photos: Sequence[str]) -> list[str]:
     if not photos:
         return []
     return [
-        f"{counted(len(photos), 'photo')} placed with little evidence, perhaps imprecisely or wrongly "
+        f"{counted(len(photos), 'photo')} registered with little evidence, perhaps imprecisely or wrongly "
         f"('provisional' in scene.json): {shortlist(photos)}; take more photos beside these, or leave them "
         "out if they blur the model"
     ]

@@ -275,7 +275,7 @@ class Stages:
             if registered >= plan.below * len(photos) and not bent:
                 break
             if attempts:
-                self.bar.say(f"{registered} of {len(photos)} photos placed: trying harder")
+                self.bar.say(f"{registered} of {len(photos)} photos registered: trying harder")
             before = attempts[-1] if attempts else None
             attempts.append(self._attempt(work, screened, photos, masks, plan, before, known))
         # Of attempts that register as many photos reliably, the last is taken, which is the most precise.
@@ -386,11 +386,11 @@ def split_photos(photos: Sequence[ScreenedPhoto], registered: set[str], tests: s
     train = [photo.name for photo in inside if photo.name not in test]
     if wanted and not test:
         raise AwError(
-            f"none of the {wanted} test photos could be placed among the training photos: they show "
+            f"none of the {wanted} test photos could be registered to the training photos: they show "
             "another place or too little overlap; take them nearer to the training views"
         )
     if len(train) < 2:
-        raise AwError(f"only {len(train)} training photos could be placed; a scene needs at least 2")
+        raise AwError(f"only {len(train)} training photos could be registered; a scene needs at least 2")
     if len(test) < wanted:
         warnings.append(f"{wanted - len(test)} of {wanted} test photos are lost: scores cover {len(test)}")
     return PhotoSplit(train, test, how, warnings)

@@ -150,7 +150,7 @@ def command(
     from ambiguous_wild.io.images import image_size
 
     settings["name"] = "" if name is None else check_name("scene name", name)
-    # A core is idle while photos are placed, and training needs the kernels next.
+    # A core is idle while photos are registered, and training needs the kernels next.
     with kernels_meanwhile():
         result = build_scene(
             raw,

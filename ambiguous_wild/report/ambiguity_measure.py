@@ -162,7 +162,7 @@ def feature_family(spec: str) -> str:
 
 def weight_free(spec: str) -> bool:
     """Return whether the features have no pretrained weights; such features are whitened over the scene."""
-    from ambiguous_wild.vision.backends import DINO
+    from ambiguous_wild.vision.weight_registry import DINO
 
     return feature_family(spec) not in DINO
 

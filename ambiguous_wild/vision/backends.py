@@ -14,34 +14,9 @@ from ambiguous_wild.core.config import with_options
 from ambiguous_wild.core.errors import unknown
 from ambiguous_wild.core.weight_files import expanded
 from ambiguous_wild.vision.protocols import Features, Instances
-from ambiguous_wild.vision.weight_registry import find_weight, get_weight
+from ambiguous_wild.vision.weight_registry import DINO, SAM, SAM_VIDEO, find_weight, get_weight
 
 # name in a spec -> name of the weights, see vision/weight_registry.py
-DINO = {
-    "dinov2-small": "dinov2-small",
-    "dinov2-base": "dinov2-base",
-    "dinov2-small-registers": "dinov2-with-registers-small",
-    "dinov2-base-registers": "dinov2-with-registers-base",
-    "dino-vits16": "dino-vits16",
-    "dino-vits8": "dino-vits8",
-    "dino-vitb16": "dino-vitb16",
-    "dino-vitb8": "dino-vitb8",
-}
-SAM = {
-    "sam": "sam-vit-base",
-    "sam-large": "sam-vit-large",
-    "sam-huge": "sam-vit-huge",
-    "sam2": "sam2.1-hiera-tiny",
-    "sam2-small": "sam2.1-hiera-small",
-    "sam2-base-plus": "sam2.1-hiera-base-plus",
-    "sam2-large": "sam2.1-hiera-large",
-}
-SAM_VIDEO = {
-    "sam2-video": "sam2.1-hiera-tiny",
-    "sam2-small-video": "sam2.1-hiera-small",
-    "sam2-base-plus-video": "sam2.1-hiera-base-plus",
-    "sam2-large-video": "sam2.1-hiera-large",
-}
 CONV = ("efficientnet-lite0", "vgg16")  # the same names for weights, features and instances
 FEATURES = ("labhog", "sceneconv", *CONV, *DINO)
 INSTANCES = ("graph", *CONV, *SAM, *SAM_VIDEO, "grounded", "grounded-video", "labels")

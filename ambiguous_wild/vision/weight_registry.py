@@ -18,6 +18,32 @@ RECEIPT = "source.json"  # says which commit of the hub was downloaded
 _HUB_FILES = ("config.json", TENSORS)
 _TEXT_FILES = (*_HUB_FILES, "tokenizer.json", "tokenizer_config.json")
 _FEATURES, _MASKS, _TRACKS = "features", "instance masks", "instance masks and identities"
+# features and instance masks -> their weights
+DINO = {
+    "dinov2-small": "dinov2-small",
+    "dinov2-base": "dinov2-base",
+    "dinov2-small-registers": "dinov2-with-registers-small",
+    "dinov2-base-registers": "dinov2-with-registers-base",
+    "dino-vits16": "dino-vits16",
+    "dino-vits8": "dino-vits8",
+    "dino-vitb16": "dino-vitb16",
+    "dino-vitb8": "dino-vitb8",
+}
+SAM = {
+    "sam": "sam-vit-base",
+    "sam-large": "sam-vit-large",
+    "sam-huge": "sam-vit-huge",
+    "sam2": "sam2.1-hiera-tiny",
+    "sam2-small": "sam2.1-hiera-small",
+    "sam2-base-plus": "sam2.1-hiera-base-plus",
+    "sam2-large": "sam2.1-hiera-large",
+}
+SAM_VIDEO = {
+    "sam2-video": "sam2.1-hiera-tiny",
+    "sam2-small-video": "sam2.1-hiera-small",
+    "sam2-base-plus-video": "sam2.1-hiera-base-plus",
+    "sam2-large-video": "sam2.1-hiera-large",
+}
 GROUPS = {"lpips": ("alexnet", "vgg16", "lpips-alex", "lpips-vgg")}  # names for several weights
 
 
@@ -149,19 +175,20 @@ def get_weight(name: str) -> Weight:
 
 
 def select_weights(names: Iterable[str]) -> list[Weight]:
-    """Return the weights of these names or `GROUPS`, each once, in the order of the names.
+    """Return the weights of these names, each once: of weights, `GROUPS`, features or instance masks.
 
     Raises:
         AwError: an unknown name; names the nearest.
     """
     every = {weight.name: weight for weight in KNOWN + OTHER_SIZES}
+    used_by = DINO | SAM | SAM_VIDEO
     selected: dict[str, Weight] = {}
     for name in names:
-        for member in GROUPS.get(name, (name,)):
+        for member in GROUPS.get(name, (used_by.get(name, name),)):
             if member not in every:
                 from ambiguous_wild.core.errors import unknown
 
-                raise unknown("weights", name, [*every, *GROUPS], "'aw weights list' lists them")
+                raise unknown("weights", name, [*every, *used_by, *GROUPS], "'aw weights list' lists them")
             selected[member] = every[member]
     return list(selected.values())
 

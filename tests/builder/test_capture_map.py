@@ -216,7 +216,7 @@ def test_photos_left_out_are_drawn_where_they_would_be() -> None:
 def test_other_components_are_listed_and_not_drawn() -> None:
     registered = NAMES[:5]
     drawn = drawn_with(registered, links=all_links(registered), components=[registered, NAMES[5:]])
-    assert len(drawn.photos) == 5 and drawn.title.startswith("5 of 8 photos placed")
+    assert len(drawn.photos) == 5 and drawn.title.startswith("5 of 8 photos registered")
     assert drawn.listed == ["another part, 3 photos: walk/IMG_5.jpg, walk/IMG_6.jpg, walk/IMG_7.jpg"]
     assert drawn.advice == [
         "take a photo that shows both walk/IMG_4.jpg and walk/IMG_5.jpg, to join the parts"

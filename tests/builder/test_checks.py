@@ -88,7 +88,7 @@ def test_a_stranger_does_not_hang_together_and_a_copy_is_a_duplicate(
     again = cv2.convertScaleAbs(clean[2], alpha=0.97)
     found = checks(tmp_path / "raw", [*clean, again, stranger])
     assert found["overlap"].photos == ("p09.png",)
-    assert found["overlap"].finding.startswith("about 9 of 10 photos will be placed; the others share")
+    assert found["overlap"].finding.startswith("about 9 of 10 photos will be registered; the others share")
     assert found["overlap"].advice == "take 2 or 3 photos between p08.png and p09.png"
     assert found["near-duplicates"].photos == ("p08.png",)
 
@@ -98,7 +98,7 @@ def test_few_pairs_that_overlap_are_counted(clean: list[np.ndarray], tmp_path: P
     few = checks(tmp_path / "few", [*clean[:3], *strangers])["overlap"]
     assert few.finding.endswith("; most pairs share too few features (3 of 28 share enough)")
     none = checks(tmp_path / "none", strangers)["overlap"].finding
-    assert none.endswith("none will be placed; most pairs share too few features (0 of 10 share enough)")
+    assert none.endswith("none will be registered; most pairs share too few features (0 of 10 share enough)")
 
 
 @pytest.mark.parametrize("step", [0.12, 0.3])

@@ -242,7 +242,7 @@ def test_photos_of_different_places_fail_cleanly_with_the_figures(tmp_path):
     (tmp_path / "raw").mkdir()
     for i in range(4):
         cv2.imwrite(str(tmp_path / "raw" / f"{i}.png"), texture(10 + i)[:240, :320])
-    with pytest.raises(AwError, match=r"placed \d of 4 photos.*median \d+ features.*overlap too little"):
+    with pytest.raises(AwError, match=r"registered \d of 4 photos.*median \d+ features.*overlap too little"):
         build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500))
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]
 
@@ -268,7 +268,7 @@ def test_identical_photos_fail_cleanly(tmp_path):
         cv2.imwrite(
             str(path.with_name(f"q{level}.png")), cv2.imread(str(path)), [cv2.IMWRITE_PNG_COMPRESSION, level]
         )
-    with pytest.raises(AwError, match=r"placed \d of 3 photos"):
+    with pytest.raises(AwError, match=r"registered \d of 3 photos"):
         build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500))
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]
 

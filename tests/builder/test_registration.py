@@ -186,8 +186,8 @@ def test_a_photo_without_a_clear_pose_is_named_with_the_reason():
     assert "two poses: 6 photos agree on one, 5 on another" in str(
         rejection_reason(hypothesis(6, 0.2), hypothesis(5, 0.19), 2)
     )
-    assert "no placed photo" in str(rejection_reason(nothing, nothing, 2))
-    assert "only 2 placed photos" in str(rejection_reason(hypothesis(2, 0.4), nothing, 3))
+    assert "no registered photo" in str(rejection_reason(nothing, nothing, 2))
+    assert "only 2 registered photos" in str(rejection_reason(hypothesis(2, 0.4), nothing, 3))
     assert "small part" in str(rejection_reason(hypothesis(5, 0.07), nothing, 2))
     clustered = PoseHypothesis(
         np.eye(4)[:3], frozenset(range(5)), 0.25, 0.2
@@ -310,6 +310,6 @@ def test_a_model_whose_photos_do_not_agree_ends_in_a_refusal(tmp_path, monkeypat
         monkeypatch,
         "registration.MIN_SUPPORT = registration.MIN_SUPPORT_NEW = pose_hypothesis.LITTLE_AREA = 99",
     )
-    with pytest.raises(AwError, match="placed 0 of 6 photos"):
+    with pytest.raises(AwError, match="registered 0 of 6 photos"):
         build_scene(tmp_path / "raw", tmp_path / "scene", BuildSettings(max_features=500, sfm="fast"))
     assert [p.name for p in tmp_path.iterdir()] == ["raw"]

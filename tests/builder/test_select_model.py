@@ -23,7 +23,7 @@ def summary(images, points=None):
 def test_each_lost_photo_gets_its_reason():
     photos = [ScreenedPhoto(f"{n}.JPG", f"{n}.jpg") for n in "abc"]
     features = {"a.jpg": 900, "b.jpg": 12, "c.jpg": 900}
-    left_out = {"b.jpg": "no placed photo agrees", "c.jpg": "two poses"}
+    left_out = {"b.jpg": "no registered photo agrees", "c.jpg": "two poses"}
     assert _lost_photos(photos, left_out, features) == [
         {"source": "b.JPG", "reason": "only 12 features"},
         {"source": "c.JPG", "reason": "two poses"},
@@ -53,19 +53,26 @@ TURNED = dataclasses.replace(FACTS, verified=12, degenerate=1.0, angle_deg=0.3)
     [
         (summary(3), 10, 0, 1, FACTS, None),
         (summary(3), 3, 0, 1, FACTS, None),
-        (summary(8), 29, 0, 1, FACTS, r"placed 8 of 29 photos;.*needs 9"),
-        (None, 4, 2, 1, FACTS, r"placed 0 of 4 photos, 2 were left out.*needs 3"),
+        (summary(8), 29, 0, 1, FACTS, r"registered 8 of 29 photos;.*needs 9"),
+        (None, 4, 2, 1, FACTS, r"registered 0 of 4 photos, 2 were left out.*needs 3"),
         (
             summary(4, 0),
             12,
             0,
             1,
             TURNED,
-            r"placed 4 of 12 photos with 0 points.*needs 4 and 10.*turned",
+            r"registered 4 of 12 photos with 0 points.*needs 4 and 10.*turned",
         ),
         (summary(4, 40), 12, 0, 1, TURNED, None),
         (summary(4, 400), 40, 0, 2, FACTS, None),  # the user asked for a small part
-        (summary(4, 400), 40, 0, 1, FACTS, "placed 4 of 40 photos"),  # the first part is most of the place
+        (
+            summary(4, 400),
+            40,
+            0,
+            1,
+            FACTS,
+            "registered 4 of 40 photos",
+        ),  # the first part is most of the place
     ],
 )
 def test_enough_photos_and_points_pass(tmp_path, monkeypatch, model, photos, skipped, part, facts, message):

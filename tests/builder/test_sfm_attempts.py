@@ -90,7 +90,7 @@ def test_a_part_that_does_not_exist_is_refused(monkeypatch):
     ],
 )
 def test_the_attempt_that_places_more_is_kept(monkeypatch, fast, wider, thorough, tried, chosen):
-    """All pairs are matched only if less than nine tenths are placed."""
+    """All pairs are matched only if less than nine tenths are registered."""
     names, kept = attempts(monkeypatch, {"fast": fast, "wider": wider, "thorough": thorough}, 30)
     assert names == ["fast", "wider", "thorough", "covariant"][:tried] and kept == chosen
 

@@ -106,12 +106,12 @@ def test_a_step_of_another_command_advises_nothing_that_is_not_its_own():
 def test_photos_placed_with_little_evidence_come_with_an_advice():
     assert provisional_warnings([]) == []
     (line,) = provisional_warnings(["a.jpg", "b.jpg"])
-    assert line.startswith("2 photos placed with little evidence") and ": a.jpg, b.jpg; take more" in line
+    assert line.startswith("2 photos registered with little evidence") and ": a.jpg, b.jpg; take more" in line
 
 
-@pytest.mark.parametrize(("placed", "missing"), [(13, 11), (24, None), (20, None)])
-def test_the_verdict_says_that_much_of_a_walk_is_missing(placed, missing):
-    counts = {"registered": placed, "photos": 24, "readable": 24, "points": 900}
+@pytest.mark.parametrize(("registered", "missing"), [(13, 11), (24, None), (20, None)])
+def test_the_verdict_says_that_much_of_a_walk_is_missing(registered, missing):
+    counts = {"registered": registered, "photos": 24, "readable": 24, "points": 900}
     line = verdict(
         {"counts": counts, "lost": [], "reprojection_error_px": 0.5, "factor": 1}, (4, 3), Path("s")
     )

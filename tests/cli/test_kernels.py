@@ -1,4 +1,4 @@
-"""Kernels that are compiled while photos are placed."""
+"""Kernels that are compiled while photos are registered."""
 
 from __future__ import annotations
 

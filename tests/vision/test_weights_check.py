@@ -115,6 +115,13 @@ def test_a_classifier_is_not_part_of_the_digest_and_the_container_neither() -> N
     )
 
 
+def test_features_and_instance_masks_stand_for_their_weights() -> None:
+    chosen = weight_registry.select_weights(["dinov2-small-registers", "sam2", "sam2-video", "vgg16"])
+    assert [w.name for w in chosen] == ["dinov2-with-registers-small", "sam2.1-hiera-tiny", "vgg16"]
+    for weight in {**weight_registry.DINO, **weight_registry.SAM, **weight_registry.SAM_VIDEO}.values():
+        assert weight_registry.get_weight(weight).name == weight
+
+
 def test_unknown_names_name_the_nearest() -> None:
     for words in (("get", "lpip"), ("check", "lpip")):
         error = run(*words).exception

@@ -6,7 +6,7 @@ photo at `side` px (published: ResNet-18 at full size); no LPIPS term (it needs 
 to colours, because the renderer clamps at 0; positions are in units of the scene, without a gradient of the
 net (that of the release is unverified); boxes start at the photo's size (published: 512 px); the net's output
 is added to the colour in the first three intrinsic features (`residual`: 24.3 instead of 22.9 dB after 700
-iterations of a time-of-day, because the net need not learn every colour).
+iterations where the time of day changes, because the net need not learn every colour).
 
 Of a test photo the net gets only the left half (released: all of it); a camera without a photo gets the mean
 of the train photos' maps. Gaussians outside of the part that may be read get the mean of their samples in at

@@ -219,13 +219,13 @@ def test_an_infinite_value_of_the_shipped_board_enters_no_mean_and_no_rank() -> 
     covered = [
         run
         for run in board["runs"]
-        if (run["dataset"], run["method"]) == ("simulated", "dronesplat") and "psnr_covered" in run["quality"]
+        if (run["dataset"], run["method"]) == ("aw-sim", "dronesplat") and "psnr_covered" in run["quality"]
     ]
     lost = [run for run in covered if run["scene"] == covered[0]["scene"]]
     for run in lost:
         run["quality"]["psnr_covered"] = "inf"
     script = (
-        "const key = 'psnr_covered', found = groups('simulated');"
+        "const key = 'psnr_covered', found = groups('aw-sim');"
         "const all = found.map((g) => summary(g, key, chosenScenes()));"
         "const placed = ranks(rankable(found, all, key), key);"
         "console.log(JSON.stringify(found.map((g, i) => [g.method, all[i].value, placed[i], all[i].cells])));"

@@ -34,6 +34,17 @@ def ghosts(consistent: bool = True, **changes: Any) -> list[dict[str, Any]]:
     return runs
 
 
+def test_the_note_names_the_pixels_of_each_metric_that_is_ranked_instead(tmp_path: Path) -> None:
+    runs = ghosts()
+    for run in runs:
+        for row in run["per_image"]:
+            row["psnr_valid"] = 20.0
+    table = papers.in_blocks(read_runs(save(tmp_path, *runs)))
+    (note,) = [note for note in table[-1].notes if "ranked is" in note]
+    assert "PSNR valid, over pixels that the masks of test photos keep" in note
+    assert "PSNR consistent, over pixels that other photos show alike" in note
+
+
 def test_the_model_with_the_ghosts_is_not_first_where_test_photos_may_hold_distractors(
     tmp_path: Path,
 ) -> None:

@@ -190,7 +190,9 @@ def main(words: Sequence[str] | None = None) -> int:
     failed = run_all([run for scene in scenes.values() for run in runs_of(scene, args)], args.jobs)
     if drawn := [name for name in scenes if name in DRAWN]:
         write_drawn(drawn, args)
-    for name in (name for name in scenes if name not in DRAWN):
+    for name in scenes:
+        if name in DRAWN:
+            continue
         # photos of --data may not be passed on
         dataset, images = (real[name].dataset, "0") if name in real else (SUITE.dataset, "1")
         add = ("leaderboard", "add", str(args.runs / name), "--board", str(args.board))

@@ -209,10 +209,11 @@ def bench(
     engine = Engine() if engine is None else engine
     engine = engine if jobs is None else dataclasses.replace(engine, jobs=jobs)
     engine.check()
-    unsent = {"--overwrite longer": overwrite == "longer", "--corrections": corrections, "--start": start}
-    if engine.transfer == "store" and any(unsent.values()):
+    files = {"--overwrite longer": overwrite == "longer", "--corrections": corrections, "--start": start}
+    needed = [option for option, given in files.items() if given]
+    if engine.transfer == "store" and needed:
         raise AwError(
-            f"{next(option for option, given in unsent.items() if given)} needs a file that --set "
+            f"{needed[0]} needs a file that --set "
             "engine.transfer=store does not send: leave it out, with -o on storage that all nodes share"
         )
     metrics = [metrics] if isinstance(metrics, str | Path) else metrics

@@ -118,14 +118,18 @@ class SplatfactoColours(AutogradEffect):
         }
 
     def forward(self, visible: VisibleGaussians, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
-        photo = leaf["photo"].expand(len(visible.means), PHOTO)
-        feature = visible.attributes["splatfacto_feature"]
-        hidden = F.relu(mlp(torch.cat([photo, feature], dim=1), leaf, "net"))
-        basis = _up_to(
-            harmonics(directions(visible.means.detach(), context.camera), 3), context.nominal // 2000
-        )
-        rest = mlp(hidden, leaf, "rest").reshape(-1, 15, 3)
-        return 0.5 + basis[:, :1] * mlp(hidden, leaf, "dc") + (basis[:, 1:, None] * rest).sum(dim=1)
+        weight = leaf["net_weight0"]
+        net = {
+            **leaf,
+            "net_weight0": weight[PHOTO:],  # the embedding's part is the same for every Gaussian
+            "net_bias0": leaf["net_bias0"] + leaf["photo"] @ weight[:PHOTO],
+            **{f"head_{kind}0": torch.cat([leaf[f"dc_{kind}0"], leaf[f"rest_{kind}0"]], dim=-1)
+               for kind in ("weight", "bias")},
+        }  # fmt: skip
+        hidden = F.relu(mlp(visible.attributes["splatfacto_feature"], net, "net"))
+        coefficients = mlp(hidden, net, "head").reshape(-1, 16, 3)
+        basis = harmonics(directions(visible.means.detach(), context.camera), 3)
+        return 0.5 + torch.einsum("mk,mkc->mc", _up_to(basis, context.nominal // 2000), coefficients)
 
     def background(self, leaf: Mapping[str, Tensor], context: ViewContext) -> Tensor:
         """Return the background [H, W, 3] of the view context's photo, without an offset."""

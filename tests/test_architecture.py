@@ -81,11 +81,11 @@ def test_the_table_of_packages_is_what_the_code_imports() -> None:
 
 
 def test_the_drawing_has_every_package_and_no_arrow_goes_up() -> None:
-    floors = [line.split() for line in DESIGN.split("```")[1].strip().splitlines()]
-    floor = {name: level for level, line in enumerate(floors) for name in line}
+    layers = [line.split() for line in DESIGN.split("```")[1].strip().splitlines()]
+    layer = {name: level for level, line in enumerate(layers) for name in line}
     arrows = imported_packages()
-    assert sorted(name for line in floors for name in line) == sorted(arrows)
-    assert not [(a, b) for a, below in arrows.items() for b in below if floor[a] >= floor[b]]
+    assert sorted(name for line in layers for name in line) == sorted(arrows)
+    assert not [(a, b) for a, below in arrows.items() for b in below if layer[a] >= layer[b]]
 
 
 def test_the_reader_of_imports_sees_every_form() -> None:
@@ -157,7 +157,7 @@ def test_the_finder_of_circles_finds_them() -> None:
     real = import_graph()
     ours = "ambiguous_wild.methods"
     assert f"{ours}.graft" in real[f"{ours}.registry"]
-    assert f"{ours}.given_masks" in real[f"{ours}.graft"]  # inside a function
+    assert f"{ours}.mask_policies" in real[f"{ours}.graft"]  # inside a function
     assert f"{ours}.external_process" in real[f"{ours}.entry"]  # for types alone
     assert "ambiguous_wild.core" in real[f"{ours}.truth"]  # a name of a package
 

@@ -277,7 +277,7 @@ class Cell:
             return ""
         if self.method.program is not None:
             return "the program wrote no masks"
-        from ambiguous_wild.methods.given_masks import makes_masks
+        from ambiguous_wild.methods.mask_policies import makes_masks
 
         if not makes_masks(self.method.build(self.options)):
             return "the method makes no masks"

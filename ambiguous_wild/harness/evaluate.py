@@ -19,7 +19,7 @@ from ambiguous_wild.io.files import atomic_dir
 from ambiguous_wild.io.images import read_png_rgb, to_uint8, write_png
 from ambiguous_wild.io.mask_reasons import FILE as REASONS
 from ambiguous_wild.io.mask_reasons import MaskReasons, reasons_of, write_reasons
-from ambiguous_wild.methods.given_masks import makes_masks
+from ambiguous_wild.methods.mask_policies import makes_masks
 from ambiguous_wild.metrics import image as image_metrics
 from ambiguous_wild.metrics import mask_scores as mask_metrics
 from ambiguous_wild.splat import backend

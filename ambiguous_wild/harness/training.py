@@ -36,7 +36,7 @@ from ambiguous_wild.harness.start import with_start
 from ambiguous_wild.io.files import atomic_dir, own_json, sha256_file, write_json
 from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.io.ply import write_splat_ply
-from ambiguous_wild.methods.given_masks import FixedMasks, makes_masks
+from ambiguous_wild.methods.mask_policies import FixedMasks, makes_masks
 from ambiguous_wild.splat.data import load_train_data
 from ambiguous_wild.splat.effects import with_effects
 from ambiguous_wild.splat.method_hooks import MethodHooks

@@ -18,7 +18,7 @@ from ambiguous_wild.io.keep_resize import smaller_keep
 from ambiguous_wild.io.lens import Lens, make_lens
 from ambiguous_wild.io.mask_files import SPELLINGS, find_masks
 from ambiguous_wild.io.original_photos import OriginalPhoto, original_photos
-from ambiguous_wild.methods.given_masks import FixedMasks
+from ambiguous_wild.methods.mask_policies import FixedMasks
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import TrainData
 

@@ -212,7 +212,7 @@ def _members(name: str, entries: Mapping[str, MethodEntry], options: Any) -> tup
 
 def combine_policies(mask: Any, regulariser: Any) -> Any:
     """Join two policies to one: keep maps of `mask`, losses of `regulariser`."""
-    from ambiguous_wild.methods.given_masks import GraftedMaskPolicy
+    from ambiguous_wild.methods.mask_policies import GraftedMaskPolicy
 
     if regulariser is mask:
         return mask

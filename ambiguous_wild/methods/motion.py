@@ -18,7 +18,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import check_limits
 from ambiguous_wild.io.motion_points import read_motion_points
 from ambiguous_wild.io.palette import MASKED, faded, tint
-from ambiguous_wild.methods.given_masks import FixedMasks
+from ambiguous_wild.methods.mask_policies import FixedMasks
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import Step, TrainData
 from ambiguous_wild.vision.backends import check_instances, make_instances

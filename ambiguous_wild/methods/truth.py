@@ -20,7 +20,7 @@ from ambiguous_wild.core.config import Facts
 from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.io.images import read_gray
 from ambiguous_wild.methods.entry import NoOptions
-from ambiguous_wild.methods.given_masks import FixedMasks
+from ambiguous_wild.methods.mask_policies import FixedMasks
 from ambiguous_wild.splat.data import read_photos
 from ambiguous_wild.splat.method_hooks import MethodHooks
 from ambiguous_wild.splat.step import TrainData

@@ -12,7 +12,7 @@ from ambiguous_wild.harness import training as passes
 from ambiguous_wild.harness.run_cost import two_pass_cost
 from ambiguous_wild.io.images import read_keep_map
 from ambiguous_wild.methods import get_method
-from ambiguous_wild.methods.given_masks import FixedMasks
+from ambiguous_wild.methods.mask_policies import FixedMasks
 from ambiguous_wild.methods.registry import knows_truth
 from tests.methods.baselines import data_of, step_of
 from tests.tiny_scene import TRAIN

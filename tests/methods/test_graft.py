@@ -13,8 +13,8 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import with_options
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.methods import MethodEntry, get_method, register
-from ambiguous_wild.methods.given_masks import GraftedMaskPolicy
 from ambiguous_wild.methods.graft import check_graft, combine_policies, graft_name
+from ambiguous_wild.methods.mask_policies import GraftedMaskPolicy
 from ambiguous_wild.methods.refinesplat.density_control import EntropyAwareDensity
 from ambiguous_wild.methods.refinesplat.recipe import RefineSplatMask
 from ambiguous_wild.methods.robustsplat import RobustSplatConfig, RobustSplatMask

@@ -1,4 +1,4 @@
-"""Fixed masks of a first pass, and policies grafted from masks and losses of two methods."""
+"""Mask policies that recipes share: fixed keep maps, and the mask of one method with the loss of another."""
 
 from __future__ import annotations
 

@@ -128,24 +128,21 @@ def _colmap(scene: Scene, folder: Path, put: CopyOrLink, masks: bool = True) -> 
         put(view.image_path, folder / "images" / _stored(view))
     write_model(folder / "sparse" / "0", _sized_model(scene))
     _write_lists(scene, folder)
-    for view in scene.train if masks else ():
+    for view in scene.views if masks else ():
         if view.keep_path is not None:
             _write_mask(view, folder / "masks" / f"{_stored(view)}.png")
     return []
 
 
 def _nerfbaselines(scene: Scene, folder: Path, put: CopyOrLink) -> list[str]:
-    """Write the COLMAP layout with nb-info.json and with keep masks where NerfBaselines looks for them."""
+    """Write the COLMAP layout with nb-info.json and with keep masks where NerfBaselines looks for them.
+
+    Its scores blacken what a test photo's mask hides, in the photo and in the render.
+    """
     _colmap(scene, folder, put, masks=False)
-    masked = [view for view in scene.train if view.keep_path is not None]
-    for view in masked:
-        _write_mask(view, folder / "masks" / f"{without_suffix(view.name)}.png")
-    if masked:
-        # NerfBaselines needs a mask for every photo, or none; a white mask uses all of a photo.
+    if any(view.keep_path for view in scene.views):  # NerfBaselines needs a mask for every photo, or none
         for view in scene.views:
-            target = folder / "masks" / f"{without_suffix(view.name)}.png"
-            if not target.is_file():
-                write_png(target, np.full((view.camera.height, view.camera.width), 255, np.uint8))
+            _write_mask(view, folder / "masks" / f"{without_suffix(view.name)}.png")
     write_json(folder / "nb-info.json", nerfbaselines_info(1, scene.name, half=_half(scene)))
     return []
 
@@ -158,7 +155,7 @@ def _half(scene: Scene) -> bool:
 def _nerfstudio(scene: Scene, folder: Path, put: CopyOrLink) -> list[str]:
     """Write transforms.json with lists, points and masks, for `--data FOLDER nerfstudio-data`."""
     frames = []
-    masked = any(view.keep_path for view in scene.train)
+    masked = any(view.keep_path for view in scene.views)
     for view in scene.views:
         name = f"images/{_stored(view)}"
         put(view.image_path, folder / name)
@@ -215,7 +212,7 @@ def _on_the_go(scene: Scene, folder: Path, put: CopyOrLink) -> list[str]:
     sides = {"clutter": "train", "extra": "test"}
     split = {word: [i for i, v in enumerate(views) if v.split == side] for word, side in sides.items()}
     write_json(folder / "split.json", {**split, "clean": []})
-    masks = ["keep masks"] if any(v.keep_path for v in scene.train) else []
+    masks = ["keep masks"] if any(v.keep_path for v in scene.views) else []
     return [*_protocol_lost(scene), "points", *masks]
 
 
@@ -235,6 +232,7 @@ def _camera_to_world(view: View) -> list[list[float]]:
 
 
 def _write_mask(view: View, target: Path) -> None:
+    """Write the keep mask of a photo, white if it has none: all of the photo is used."""
     if view.keep_path is None:
         pixels = np.full((view.camera.height, view.camera.width), 255, np.uint8)
     else:

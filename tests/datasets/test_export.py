@@ -12,13 +12,13 @@ import pytest
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.export import WRITERS, export_scene
 from ambiguous_wild.datasets.write import ImportSettings, import_scene
-from ambiguous_wild.io.images import read_gray, read_png_rgb
+from ambiguous_wild.io.images import read_gray, read_png_rgb, write_png
 from ambiguous_wild.io.safe_pycolmap import pycolmap
 from ambiguous_wild.io.scene_folder import load_scene
 from tests.command_line import aw
 from tests.datasets import layouts
 from tests.datasets.test_import import same_cameras
-from tests.io.model_maker import write_scene
+from tests.io.model_maker import HEIGHT, WIDTH, write_scene
 
 NERFBASELINES = "AW_NERFBASELINES"  # the program, as in tests/harness/test_nerfbaselines.py
 
@@ -63,17 +63,27 @@ def test_on_the_go_keeps_full_size_and_split(scene, tmp_path):
 
 
 @pytest.mark.parametrize("form", WRITERS)
-def test_equal_names_in_several_folders_stay_apart(form, tmp_path):
+def test_equal_names_stay_apart_and_masks_of_test_photos_go_along(form, tmp_path):
     names = [f"{side}/{i}.png" for side in ("back", "front") for i in range(4)]
     write_scene(tmp_path / "rig", names, points=60)
+    half = np.zeros((HEIGHT, WIDTH), np.uint8)
+    half[:, : WIDTH // 2] = 255
+    write_png(tmp_path / "rig" / "masks" / "test" / names[0], half)
     native = load_scene(tmp_path / "rig")
-    export_scene(native.root, form, tmp_path / "out")
+    done = export_scene(native.root, form, tmp_path / "out")
     back = load_scene(import_scene(tmp_path / "out", tmp_path / "back", ImportSettings(factor=1)).scene)
     assert [v.split for v in back.views] == [v.split for v in native.views]
     for a, b in zip(back.views, native.views, strict=True):
         assert a.name == (b.name.replace("/", "_") if form == "on-the-go" else b.name)
         assert np.array_equal(read_png_rgb(a.image_path), read_png_rgb(b.image_path))
     same_cameras(back.views, native.views)
+    if form == "on-the-go":
+        assert "keep masks" in done.left_out
+        return
+    assert np.array_equal(read_gray(back.test[0].keep_path), half)
+    # nerfstudio and NerfBaselines read a mask of every photo, or none
+    shares = {None if v.keep_path is None else read_gray(v.keep_path).mean() for v in back.train}
+    assert shares == ({None} if form == "colmap" else {255})
 
 
 def test_colmap_itself_reads_it(scene, tmp_path):

@@ -28,6 +28,7 @@ _TYPES = {
 _FORMS = ("binary_little_endian", "binary_big_endian", "ascii")
 _COLOURS = ("red", "green", "blue")
 _SPELLINGS = (_COLOURS, tuple(f"diffuse_{c}" for c in _COLOURS), tuple("rgb"), ("Red", "Green", "Blue"))
+_DISK = np.log(1e-6)  # third log scale of 2DGS's disks, which have two; as SuperSplat reads them
 _SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "sh0": (3,)}
 
 
@@ -148,7 +149,7 @@ def read_splat_ply(path: Path | str) -> dict[str, np.ndarray]:
     """Read a splat PLY, ours or another tool's; arrays as `write_splat_ply` takes them, float32.
 
     A model of a scene that was moved is returned in the scene's inner coordinates. Columns may have any order
-    and precision; unknown ones are ignored.
+    and precision; unknown ones are ignored. Disks of 2DGS become flat Gaussians.
 
     Raises:
         AwError: no splat PLY, cut short, columns that are missing or whole numbers, or harmonics of a degree
@@ -165,7 +166,9 @@ def decode_ply(data: bytes, path: Path | str) -> SplatFile:
     rest = sum(name.startswith("f_rest_") for name in present)
     if rest not in (0, 9, 24, 45):
         raise AwError(f"{path} has {rest} f_rest columns; degree 0 to 3 have 0, 9, 24 or 45")
-    missing = [c for c in _columns(rest // 3) if c not in present and c not in ("nx", "ny", "nz")]
+    disks = {"scale_0", "scale_1"} <= present and "scale_2" not in present
+    unneeded = {"nx", "ny", "nz"} | ({"scale_2"} if disks else set())
+    missing = [c for c in _columns(rest // 3) if c not in present | unneeded]
     if missing:
         points = {"x", "y", "z"} <= present and "opacity" not in present
         hint = "; to train from its points: aw bench --start" if points else ""
@@ -181,11 +184,13 @@ def decode_ply(data: bytes, path: Path | str) -> SplatFile:
     arrays = {
         "means": columns(["x", "y", "z"]),
         "quats": columns([f"rot_{i}" for i in range(4)]),
-        "log_scales": columns([f"scale_{i}" for i in range(3)]),
+        "log_scales": columns([f"scale_{i}" for i in range(2 if disks else 3)]),
         "opacity_logits": columns(["opacity"])[:, 0],
         "sh0": columns([f"f_dc_{i}" for i in range(3)]),
         "sh_rest": higher,
     }
+    if disks:
+        arrays["log_scales"] = np.pad(arrays["log_scales"], ((0, 0), (0, 1)), constant_values=_DISK)
     if "filter_3D" in present:
         arrays |= _fused(arrays, columns(["filter_3D"]))
     return SplatFile(dict(rescaled(arrays, transform.scale)), transform, header_antialias(data))

@@ -29,6 +29,7 @@ from ambiguous_wild.io.splat_arrays import (
     transform_from,
     transform_record,
 )
+from ambiguous_wild.io.untrusted import read_bytes
 
 _CODES = 256  # entries of a codebook
 _MAX_PALETTE = 65536
@@ -95,6 +96,19 @@ def encode_sog(
             archive.writestr(zipfile.ZipInfo(name, _EPOCH), _webp(texture))
         archive.writestr(zipfile.ZipInfo("meta.json", _EPOCH), json.dumps(meta, allow_nan=False))
     return [file.getvalue()]
+
+
+def pack_sog(meta: Path) -> bytes:
+    """Return the file of an unpacked SOG: its meta.json and the textures beside it.
+
+    Raises:
+        AwError: a file cannot be read.
+    """
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for path in (meta, *meta.parent.glob("*.webp")):
+            archive.writestr(path.name, read_bytes(path, _MAX_TEXTURE))
+    return file.getvalue()
 
 
 def decode_sog(data: bytes, path: Path | str) -> SplatFile:

@@ -70,6 +70,20 @@ def test_columns_in_another_order_type_and_form_are_understood(tmp_path, form):
         np.testing.assert_array_equal(after[name], array)
 
 
+def test_disks_of_2dgs_become_flat_gaussians(tmp_path):
+    before = model(4)
+    before["log_scales"][:, 2] = np.log(1e-6)
+    write_splat_ply(tmp_path / "a.ply", before)
+    head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    columns = np.frombuffer(body, "<f4").reshape(4, -1)
+    head = head.replace(b"property float scale_2\n", b"") + b"end_header\n"
+    (tmp_path / "a.ply").write_bytes(head + np.delete(columns, -5, axis=1).tobytes())
+    after = read_splat_ply(tmp_path / "a.ply")
+    for name, array in before.items():
+        assert after[name].dtype == np.float32
+        np.testing.assert_array_equal(after[name], array)
+
+
 def test_junk_is_refused_by_name(tmp_path):
     path = tmp_path / "x.ply"
     write_splat_ply(path, model())

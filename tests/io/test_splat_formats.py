@@ -123,6 +123,16 @@ def test_dot_splat_is_read_by_its_name(tmp_path: Path) -> None:
         read_splats(tmp_path / "a.splat")
 
 
+def test_an_unpacked_sog_is_read_by_its_meta_json(tmp_path: Path) -> None:
+    with zipfile.ZipFile(THEIRS / "model.sog") as archive:
+        archive.extractall(tmp_path)
+    unpacked, packed = read_splats(tmp_path / "meta.json"), read_splats(THEIRS / "model.sog")
+    assert all(np.array_equal(unpacked.gaussians[name], value) for name, value in packed.gaussians.items())
+    (tmp_path / "quats.webp").unlink()
+    with pytest.raises(AwError, match=r"meta\.json is no SOG of version 2, or damaged: .*quats\.webp"):
+        read_splats(tmp_path / "meta.json")
+
+
 def spz_of_version(version: int, given: Arrays) -> bytes:
     """Our SPZ in the layout of another version, as Niantic's reference (load-spz.cc) has it."""
     raw = gzip.decompress(b"".join(encode_spz(finite(given), antialias=True)))

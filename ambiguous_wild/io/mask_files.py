@@ -19,7 +19,10 @@ NO_PHOTOS = (  # folders whose images are no photos, in upper or lower case
 OWN_MASKS = "masks.json"  # marks a folder with instances of a segmentation, not keep masks
 # a.jpg.mask.png: RealityScan; a.mask.png: OpenMVS; a_mask.png: Metashape
 MARKS = (".mask", "_mask", "-mask")
-SPELLINGS = "a mask of a.jpg is called a.png, a.jpg.png, a.mask.png, a.jpg.mask.png, a_mask.png or mask_a.png"
+SPELLINGS = (
+    "a mask of a.jpg is called a.png, a.jpg.png, a.mask.png, a.jpg.mask.png, a_mask.png or mask_a.png; "
+    ".jpg, .tif, .bmp and .webp are read too"
+)
 
 
 @dataclass(frozen=True)

@@ -147,6 +147,11 @@ def other_case_in_lists(root: Path) -> None:
     layouts.write_lists(root, [n.upper() for n in TRAIN], [n.upper() for n in layouts.TEST])
 
 
+def numpy_masks(root: Path) -> None:
+    (plain(root) / "masks").mkdir()
+    np.save(root / "masks" / f"{TRAIN[0]}.npy", KEEP)
+
+
 def wholly_transparent(root: Path) -> None:
     plain(root)
     alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
@@ -191,6 +196,7 @@ ODD = {
     "masks of LichtFeld": Odd(masked("{stem}.png", "segmentation"), masks=7),
     "masks with a prefix": Odd(masked("mask_{stem}.png"), masks=7),
     "masks beside photos": Odd(masked("{name}.mask.png", "images"), ("keep masks of 5 of 5",), 7),
+    "masks of NumPy": Odd(numpy_masks, ("not used: masks/ holds no mask: a mask of a.jpg is called a.png",)),
     "tests of 3DGS": Odd(listed_tests, ("sparse/0/test.txt names 2 of 7 photos",), kind="colmap"),
     "a point cloud": Odd(cloud, ("points from points3D.ply",), points=40),
     "more than it uses": Odd(

@@ -23,6 +23,7 @@ from ambiguous_wild.io.colmap_model import read_model
 from ambiguous_wild.io.mask_files import (
     MASK_FOLDERS,
     OWN_MASKS,
+    SPELLINGS,
     mask_files,
     masks_beside_photos,
     side_masks,
@@ -176,6 +177,9 @@ def with_masks(scene: ForeignScene) -> ForeignScene:
         files = masks_beside_photos(folder) if folder == scene.photos else mask_files(folder)
         if files:
             by_side = side_masks(folder, train, "train") | side_masks(folder, test, "test")
+        elif named:
+            note = f"not used: {folder.name}/ holds no mask: {SPELLINGS}"
+            scene = dataclasses.replace(scene, notes=(*scene.notes, note))
     used = {name: mask for name, mask in by_side.items() if scene.split.get(name) == "train"}
     tests = {mask for name, mask in by_side.items() if scene.split.get(name) == "test"}
     notes = (*scene.notes, *check_masks(folder, files, used, tests, train))

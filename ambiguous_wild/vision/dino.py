@@ -45,7 +45,7 @@ MIXED = torch.bfloat16  # has the range of float32, so gradients need no scaling
 
 @dataclass(frozen=True)
 class DinoConfig:
-    """A ViT-S/14 at 252x140 on two cores takes 0.1 s forward, 0.25 s with backward; 6 blocks take half."""
+    """Input and depth of the net; what it costs: docs/foundation-models.md."""
 
     size: int = 252  # px, longer side of the net's input, rounded to whole patches; 0 = the image's size
     blocks: int = 0  # number of blocks to run, from the first; 0 = all

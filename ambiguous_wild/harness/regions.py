@@ -17,7 +17,6 @@ import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -279,7 +278,7 @@ def exact_shadow(scene: Scene, view: View) -> np.ndarray | None:
 
 
 def _exact(scene: Scene, view: View, part: str) -> np.ndarray | None:
-    path = scene.root / "truth" / part / Path(view.name).with_suffix(".png")
+    path = scene.truth_file(part, view)
     if not path.exists():
         return None
     mask = read_gray(path) >= 128

@@ -215,6 +215,8 @@ def capture_of(
                 _copy_every(whole / side, raw / side, every)
         return raw, _comparison(raw, exact_poses(whole / "truth" / "cameras.json"))
     source = args.data / name
+    if not source.is_dir():
+        raise AwError(f"{source}: no such folder; --data holds a folder of clean photos a base")
     source = source / "images" if (source / "images").is_dir() else source
     photos = args.out / "photos" / f"{name}{thin}"
     if not photos.is_dir():

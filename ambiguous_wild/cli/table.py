@@ -214,12 +214,15 @@ def _formatted(
     from ambiguous_wild.report.papers import cost_at_the_end
     from ambiguous_wild.report.plain_formats import divided, fitted, to_long_csv, to_wide_csv
 
-    summary = counted(len(tables), "table")
-    if blocks:
-        tables = tables if width is None else fitted(tables, width)
-        scenes = sum(bool(table.columns[0].scene) for table in tables)
-        counts = {"method": len(tables[0].rows), "scene": scenes, "column": len(tables[0].columns)}
-        summary = ", ".join(counted(n, what) for what, n in counts.items())
+    if blocks and width is not None:
+        tables = fitted(tables, width)
+    columns = [column for table in tables for column in table.columns]
+    counts = {
+        tables[0].head: len({row.name for table in tables for row in table.rows}),
+        "scene": len({column.scene for column in columns} - {""}),  # none where all are means
+        "metric": len({column.measure.key for column in columns if not column.words}),
+    }
+    summary = ", ".join(counted(number, what) for what, number in counts.items() if number)
     if style == "csv":
         _echo_notes(tables, made_by)
         return to_wide_csv(tables) if blocks else to_long_csv(tables), summary

@@ -163,6 +163,10 @@ class Scene:
         red, green, blue = (code / 255 for code in self.info.get("background", (0, 0, 0)))
         return red, green, blue
 
+    def truth_file(self, part: str, view: View) -> Path:
+        """Return where a part of a photo's exact truth lies, "distractor" or "shadow", if it has any."""
+        return self.root / "truth" / part / Path(view.name).with_suffix(".png")
+
     @cached_property
     def extent(self) -> float:
         """1.1 times the largest distance of a training camera from their mean (3DGS's scene extent).

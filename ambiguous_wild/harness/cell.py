@@ -272,8 +272,7 @@ class Cell:
 
     def _why_no_masks(self, cost: Cost) -> str:
         """Return why no masks could be compared with exact ones; empty if no train photo has one."""
-        exact = self.scene.root / "truth" / "distractor"
-        if not any((exact / view.name).with_suffix(".png").is_file() for view in self.scene.train):
+        if not any(self.scene.truth_file("distractor", view).is_file() for view in self.scene.train):
             return ""
         if self.method.program is not None:
             return "the program wrote no masks"

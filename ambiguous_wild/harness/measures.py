@@ -52,11 +52,18 @@ class Measure:
     per_image: bool = True  # else one number per run
     timed: bool = False  # depends on the load of the machine: ranked only between runs that were alone
     partial: bool = False  # measured on some pixels only: an image without such pixels is left out of a mean
+    low: float = -math.inf  # smallest possible value
+    high: float = math.inf  # largest possible value
 
     @property
     def whole_photo(self) -> bool:
         """True if a distractor in a test photo counts as truth."""
         return self.per_image and self.key not in STATIC_PIXELS
+
+    @property
+    def range(self) -> float:
+        """The largest possible difference of two values."""
+        return self.high - self.low
 
     @property
     def quality(self) -> bool:
@@ -76,8 +83,6 @@ class Metric(Measure):
     function: str | Callable[..., float]  # "module:function" for ours
     needs: tuple[Literal["photo", "view", "scene"], ...] = ("photo",)  # () = only the render is needed
     unit: str = ""  # printed after the label
-    low: float = -math.inf  # smallest possible value
-    high: float = math.inf  # largest possible value
     infinite: bool = False  # inf is the right value for equal pictures
     # allowed difference when a value is verified; None: it is not verified, as that takes a network
     tolerance: float | None = 1e-6
@@ -127,7 +132,10 @@ MEASURES: dict[str, Measure] = {
         _region("psnr_uncovered", "PSNR uncovered", _REGION_DB),
         _region("psnr_supported", "PSNR supported", _REGION_DB),
         _region("psnr_consistent", "PSNR consistent", _REGION_DB),
-        *(Measure(f"mask_{k}", f"mask {v}", "higher", per_image=False) for k, v in MASK_LABELS.items()),
+        *(
+            Measure(f"mask_{k}", f"mask {v}", "higher", per_image=False, low=0.0, high=1.0)
+            for k, v in MASK_LABELS.items()
+        ),
         Measure("train_s", "train s", "lower", 1, per_image=False, timed=True),
         Measure("reference_s", "ref s", "lower", 1, per_image=False, timed=True),
         Measure("cpu_s", "cpu s", "lower", 1, per_image=False),

@@ -17,7 +17,6 @@ import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -231,24 +230,38 @@ def find_regions(scene: Scene) -> Regions:
         return _last[0][1]
 
 
+def valid_pixels(scene: Scene) -> dict[str, np.ndarray] | str:
+    """Return what masks of test photos keep, [H, W] bool by the name of the view; or why it is missing."""
+    masks = {view.name: load_keep(view, with_alpha=False) for view in scene.test}
+    kept = {name: keep > 0 for name, keep in masks.items() if keep is not None}
+    if not kept:
+        return "no test photo has a mask (masks/test/<stem>.png, white = measured)"
+    if not any(mask.any() for mask in kept.values()):
+        return "the masks in masks/test leave no pixel to measure (white = measured)"
+    return kept
+
+
+def consistent_pixels(scene: Scene) -> dict[str, np.ndarray] | str:
+    """Return `photo_consistency` where test photos may hold distractors; or why it is missing."""
+    consistent = photo_consistency(scene) if mixed_tests(scene) else "test photos hold no distractors"
+    if isinstance(consistent, str) or any(mask.any() for mask in consistent.values()):
+        return consistent
+    return "no pixel of a test photo looks as train photos show its surface"
+
+
+# Each without the other regions, whose surfaces take longer.
+STATIC = {VALID: valid_pixels, CONSISTENT: consistent_pixels}
+
+
 def _find_regions(scene: Scene) -> Regions:
     pixels: dict[str, dict[str, np.ndarray]] = {}
     missing: dict[str, str] = {}
-    masks = {view.name: load_keep(view, with_alpha=False) for view in scene.test}
-    kept = {name: keep > 0 for name, keep in masks.items() if keep is not None}
-    if any(mask.any() for mask in kept.values()):
-        pixels[VALID] = kept
-    elif kept:
-        missing[VALID] = "the masks in masks/test leave no pixel to measure (white = measured)"
-    else:
-        missing[VALID] = "no test photo has a mask (masks/test/<stem>.png, white = measured)"
-    consistent = photo_consistency(scene) if mixed_tests(scene) else "test photos hold no distractors"
-    if isinstance(consistent, str):
-        missing[CONSISTENT] = consistent
-    elif any(mask.any() for mask in consistent.values()):
-        pixels[CONSISTENT] = consistent
-    else:
-        missing[CONSISTENT] = "no pixel of a test photo looks as train photos show its surface"
+    for metric, find in STATIC.items():
+        found = find(scene)
+        if isinstance(found, str):
+            missing[metric] = found
+        else:
+            pixels[metric] = found
     masks_of_train = [exact_distractor(scene, view) for view in scene.train]
     visibility = train_visibility(scene, masks_of_train)
     if isinstance(visibility, str):
@@ -279,7 +292,7 @@ def exact_shadow(scene: Scene, view: View) -> np.ndarray | None:
 
 
 def _exact(scene: Scene, view: View, part: str) -> np.ndarray | None:
-    path = scene.root / "truth" / part / Path(view.name).with_suffix(".png")
+    path = scene.truth_file(part, view)
     if not path.exists():
         return None
     mask = read_gray(path) >= 128

@@ -98,7 +98,7 @@ def truth_files(scene: Scene, kind: str) -> list[Path]:
             f"scene {scene.name} has no exact truth ({folder} is absent): only captures of "
             "'aw simulate' and 'aw composite' have it; train another method on it"
         )
-    paths = [folder / Path(view.name).with_suffix(".png") for view in scene.train]
+    paths = [scene.truth_file(kind, view) for view in scene.train]
     absent = [view.name for view, path in zip(scene.train, paths) if not path.is_file()]
     if absent:
         raise AwError(

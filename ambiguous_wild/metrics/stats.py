@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,10 @@ class Interval:
     high: float
     count: int  # number of values
     p: float = math.nan  # two-sided
+
+    def within(self, low: float, high: float) -> Interval:
+        """Return the part of the interval that is possible; it holds the truth as often."""
+        return replace(self, low=max(self.low, low), high=min(self.high, high))
 
 
 def mean(values: Sequence[float] | np.ndarray) -> float:

@@ -253,7 +253,7 @@ def _instances(scene: Scene, masks: DistractorMasks, view: View, hidden: np.ndar
     """Label the distractors of a mask [h, w] bool: by numbers of a simulated capture, else by connection."""
     from scipy import ndimage
 
-    path = scene.root / "truth" / "instances" / f"{without_suffix(view.name)}.png"
+    path = scene.truth_file("instances", view)
     if masks.source != "truth" or not path.is_file():
         return np.asarray(ndimage.label(hidden)[0])
     size = hidden.shape[1], hidden.shape[0]

@@ -214,7 +214,7 @@ def find_background(scene: Scene, choice: str | None, run: Path | None, masks: D
         AwError: there is neither, or not the chosen one.
     """
     clean = scene.root / "truth" / "clean"
-    has_clean = any((clean / f"{without_suffix(v.name)}.png").is_file() for v in scene.train)
+    has_clean = any(scene.truth_file("clean", view).is_file() for view in scene.train)
     if choice is None:
         choice = "clean" if has_clean else "run" if run is not None else ""
     if choice == "clean" and has_clean:

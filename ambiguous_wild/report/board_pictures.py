@@ -154,7 +154,7 @@ class BoardPictures:
                 continue
             self.write(mask.photo, _jpeg(view.image_path))
             size = (view.camera.width, view.camera.height)
-            exact = scene.root / "truth" / "distractor" / Path(name).with_suffix(".png")
+            exact = scene.truth_file("distractor", view)
             if exact.is_file():
                 drawn = _overlay(read_gray(exact) >= 128, size, EXACT_RGBA)
                 self.write(replace(mask.photo, kind=EXACT), drawn)

@@ -102,13 +102,15 @@ class _SceneRuns:
         value = rows.get(view.name, {}).get(self.metric)
         return math.nan if value is None else float(value)
 
-    def pixels(self, view: View) -> np.ndarray | None:
-        """Return the pixels of a test photo that `metric` measures, [H, W] bool; None: all."""
+    @cached_property
+    def pixels(self) -> dict[str, np.ndarray]:
+        """The pixels that `metric` measures, [H, W] bool by the name of a test photo; absent: all."""
         if self.metric == "psnr":
-            return None
-        from ambiguous_wild.harness.regions import find_regions  # imports torch
+            return {}
+        from ambiguous_wild.harness.regions import STATIC  # imports torch
 
-        return find_regions(self.scene).pixels[self.metric].get(view.name)
+        found = STATIC[self.metric](self.scene)
+        return {} if isinstance(found, str) else found
 
     def notes(self) -> list[str]:
         """Return what the PSNR of doubtful test photos is of."""
@@ -281,7 +283,7 @@ def _row(group: _SceneRuns, view: View, box: Box | None, *, find: bool, errors: 
     renders = group.renders(view)
     values = [group.psnr(k, view) for k in range(len(renders))]
     texts = ["no PSNR" if math.isnan(value) else f"{value:.2f} dB" for value in values]
-    pixels = group.pixels(view)
+    pixels = group.pixels.get(view.name)
     if find:
         squared = [_difference(render, photo, 2) for render in renders]
         squared = squared if pixels is None else [error * pixels for error in squared]

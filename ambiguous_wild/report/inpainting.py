@@ -46,7 +46,7 @@ class Inpainting:
             return ""
         return (
             f"more than {UNSEEN:.0%} of the masked area is visible in no other photo, so the model cannot "
-            "know it"
+            "know it; add photos that show it, from where nothing hides it"
         )
 
     def draw(

@@ -218,10 +218,11 @@ def _pair(
         a, b = (next(row.cells[i] for row in table.rows if row.name == name) for name in (first, other))
         if a.state == b.state == "ok":  # else the measure is undefined on the scene, for both
             own[scene] = a.value - b.value
-    over_scenes = stats.mean_interval(list(own.values()))
+    span = measure.range
+    over_scenes = stats.mean_interval(list(own.values())).within(-span, span)
     over_images, on_images = NONE, Counts(0, 0, 0)
     if measure.per_image:
-        over_images = values.interval(measure.key, first, other, list(own))
+        over_images = values.interval(measure.key, first, other, list(own)).within(-span, span)
         both = [pair for scene in own if (pair := values.on(scene, measure.key, first, other)) is not None]
         on_images = counts_of([d for a, b in both for d in a.mean(axis=1) - b.mean(axis=1)], measure)
     on_scenes = counts_of(list(own.values()), measure)

@@ -285,6 +285,6 @@ def _pair(a: MethodScores, b: MethodScores, measure: Measure, scenes: Sequence[s
     head = [a.name, b.name, f"{measure.label}{ARROWS[measure.better]}"]
     if (a.failed | b.failed) & {*scenes}:  # a method must not gain by failing on hard scenes
         return [*head, "failed", "", "", f"{len(own)}"]
-    interval = stats.mean_interval(own)
+    interval = stats.mean_interval(own).within(-measure.range, measure.range)
     between = interval_text(interval, digits)
     return [*head, f"{interval.mean:+z.{digits}f}", between, counts_of(own, measure).text, f"{len(own)}"]

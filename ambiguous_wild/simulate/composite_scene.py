@@ -124,7 +124,7 @@ def check_request(root: Path, target: Path, config: CompositeConfig, cutouts: Pa
 def _check_scene(scene: Scene) -> None:
     """Raise AwError if the scene has distractors already."""
     for view in scene.train:
-        mask = scene.root / "truth" / "distractor" / Path(view.name).with_suffix(".png")
+        mask = scene.truth_file("distractor", view)
         if mask.is_file() and read_gray(mask).any():
             raise AwError(
                 f"{scene.root} has distractors already ({mask.name} is not empty); choose a scene without any"

@@ -75,7 +75,7 @@ def scene_photos(folder: Path, *, outline: bool = True) -> list[PhotoQuestion]:
     scene = load_scene(folder)
     questions = []
     for view in scene.train:
-        mask = scene.root / "truth" / "distractor" / f"{without_suffix(view.name)}.png"
+        mask = scene.truth_file("distractor", view)
         has_mask = mask.is_file()
         if has_mask and not (read_gray(mask) >= 128).any():
             continue

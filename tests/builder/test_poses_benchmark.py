@@ -67,3 +67,11 @@ def test_ways_of_before_need_a_checkout(poses, tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
         poses.main(["--data", str(tmp_path), "--out", str(tmp_path), "--ways", "before-auto"])
     assert stopped.value.code == 2 and "--before" in capsys.readouterr().err
+
+
+def test_a_base_without_photos_is_one_line(poses, tmp_path, capsys):
+    words = ["--data", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"), "--bases", "skull"]
+    assert poses.exit_code(lambda: poses.main(words)) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and f"{tmp_path / 'nowhere/skull'}: no such folder" in error
+    assert not (tmp_path / "out").exists()

@@ -33,15 +33,18 @@ def test_default_prints_a_table_and_how_it_was_made(tmp_path: Path) -> None:
     ("name", "style"),
     [("t.x", "text"), ("t.csv", "csv"), ("t.tex", "latex"), ("t.html", "html"), ("t.MD", "markdown")],
 )
+@pytest.mark.parametrize(
+    ("layout", "scenes"), [("blocks", "1 scene, "), ("paper", "1 scene, "), ("means", "")]
+)
 def test_a_file_holds_what_would_be_printed_in_the_format_of_its_suffix(
-    name: str, style: str, tmp_path: Path
+    name: str, style: str, layout: str, scenes: str, tmp_path: Path
 ) -> None:
     runs = save(tmp_path / "my runs", fake_result("3dgs"), fake_result("b", psnr=(23.0,)))
-    out, _ = aw_table(runs, "--format", style)
-    words = ["--format", style] if name == "t.x" else []
+    words = ["--layout", layout, "--metric", "psnr", "--metric", "ssim"]
+    out, _ = aw_table(runs, *words, "--format", style)
+    words += ["--format", style] if name == "t.x" else []
     printed, err = aw_table(runs, *words, "-o", tmp_path / "out" / name)
-    assert printed == "" and f"wrote {tmp_path / 'out' / name}: " in err
-    assert ("2 methods, 1 scene, " in err) == (style != "html")
+    assert printed == "" and f"wrote {tmp_path / 'out' / name}: 2 methods, {scenes}2 metrics\n" in err
     assert (tmp_path / "out" / name).read_text() == out
 
 

@@ -41,6 +41,12 @@ def test_center_is_where_the_camera_stands():
     assert np.allclose(camera.to_camera(camera.center + turned[2]), [0, 0, 1])  # it looks along its third row
 
 
+def test_the_exact_mask_of_a_photo_has_its_stem_in_the_same_subfolder():
+    view = View("left/a.JPG", Path("left/a.JPG"), camera_at(0), "train")
+    scene = replace(scene_of([]), root=Path("root"))
+    assert scene.truth_file("shadow", view) == Path("root/truth/shadow/left/a.png")
+
+
 def test_pose_cannot_be_changed_behind_ones_back():
     with pytest.raises(ValueError, match="read-only"):
         camera_at(0).cam_from_world[0, 0] = 2

@@ -145,6 +145,16 @@ def test_a_failure_is_the_result_and_says_the_last_lines_of_its_log(scene, tmp_p
     assert "out of luck" in (report.folder / "logs/train.log").read_text()
 
 
+def test_a_program_that_cannot_say_its_version_is_not_trained(scene, tmp_path):
+    _, report = run(describe(tmp_path, version="--version"), scene, tmp_path / "runs")
+    assert report.outcome == "failed"
+    assert "version of nearest ended with exit code 2; last lines of" in report.error
+    assert "usage: external_program.py" in (report.folder / "logs/version.log").read_text()
+    assert not (report.folder / "logs/train.log").exists()
+    _, report = run(describe(tmp_path, version="--help"), scene, tmp_path / "runs")
+    assert report.outcome == "trained", report.error  # the same run
+
+
 def test_a_run_that_stopped_goes_on_with_what_is_done(scene, tmp_path):
     run(describe(tmp_path, render=["render", "--nonsense"]), scene, tmp_path / "runs")
     folder = tmp_path / "runs/scene/nearest/seed3"

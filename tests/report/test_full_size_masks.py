@@ -159,9 +159,9 @@ def test_what_no_other_photo_shows_is_not_invented(made, monkeypatch):
         return Inpainting(run, scene, keeps)
 
     assert not unseen(keep).why_not("p03.png") and not unseen(keep).why_not("p00.png")
-    assert "more than 50% of the masked area is visible in no other photo" in unseen(masked).why_not(
-        "p03.png"
-    )
+    why = unseen(masked).why_not("p03.png")
+    assert "more than 50% of the masked area is visible in no other photo" in why
+    assert "add photos that show it" in why
 
 
 def _forget_masks(case):

@@ -15,6 +15,7 @@ from scipy.stats import ttest_1samp, ttest_rel
 from ambiguous_wild.cli.table import table_command
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.store import read_runs
+from ambiguous_wild.metrics.stats import mean_interval
 from ambiguous_wild.report import papers
 from ambiguous_wild.report.pairs import Counts, compared, names_of, p_text, pair_table
 from tests.harness.fake_runs import failed, fake_result, save
@@ -79,6 +80,17 @@ def test_one_scene_has_an_interval_over_images_and_no_p(tmp_path: Path) -> None:
     assert [cell.text(pairs[0].measure) for cell in row.cells[2:]] == ["—", "—", "6/0/0"]
     assert any("one scene says nothing of other scenes: no p" in note for note in notes)
     assert any("one seed of 3dgs, mine" in note for note in notes)
+
+
+def test_no_interval_holds_an_impossible_difference(tmp_path: Path) -> None:
+    """Student's t over two scenes does: masks differ by 0.2 and 0.8, 0.5 +- 12.7 * 0.3."""
+    for scene, iou in (("s0", 0.3), ("s1", 0.9)):
+        masks = [{"iou": v, "precision": v, "recall": v, "images": 2} for v in (iou, 0.1)]
+        save(tmp_path, *(fake_result(m, scene, masks=mask) for m, mask in zip(("a", "b"), masks)))
+    (pair,), _ = compared(read_runs(tmp_path), ["a", "b"], metrics=["mask_iou"])
+    assert (pair.scenes.low, pair.scenes.high) == (-1.0, 1.0) and pair.scenes.mean == pytest.approx(0.5)
+    free = mean_interval([0.2, 0.8])
+    assert pair.scenes.p == pytest.approx(free.p) and free.within(-9, 9) == free and free.high > 4
 
 
 def test_seeds_widen_the_interval_over_images(tmp_path: Path) -> None:

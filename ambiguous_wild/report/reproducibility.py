@@ -79,8 +79,8 @@ def statement(folders: Sequence[Path]) -> Statement:
     same = grouped(runs, lambda r: tuple(r.result[k] for k in ("scene", "method", "seed", "config_hash")))  # type: ignore[literal-required]
     for run, other in (copies[:2] for copies in same.values() if len(copies) > 1):
         raise AwError(
-            f"{run.folder} and {other.folder} are the same run (method, scene, seed and settings), which would be "
-            "counted twice; leave one of them out"
+            f"{run.folder} and {other.folder} are the same run (method, scene, seed and settings), which "
+            "would be counted twice; leave one of them out"
         )
     sentences = [*_grid(runs), *_code(runs), *_machine(runs), *_data(runs), _repeats(runs)]
     sentences += _later(runs)

@@ -76,7 +76,7 @@ def statement(folders: Sequence[Path]) -> Statement:
             f"no finished run below {', '.join(map(str, folders))}: 'aw bench --method NAME --scene SCENE -o "
             "RUNS' makes one"
         )
-    same = grouped(runs, lambda r: tuple(r.result[k] for k in ("scene", "method", "seed", "config_hash")))  # type: ignore[literal-required]
+    same = grouped(runs, lambda r: tuple(r.result[k] for k in ("scene", "method", "seed", "config_hash")))
     for run, other in (copies[:2] for copies in same.values() if len(copies) > 1):
         raise AwError(
             f"{run.folder} and {other.folder} are the same run (method, scene, seed and settings), which "

@@ -54,8 +54,8 @@ def command(
     """Show test photos and renders of the runs below the folders RUNS side by side, with zooms and PSNR.
 
     Photos and zooms that are not given are those where the mean squared errors of the methods differ most, in
-    either direction; they are printed as options. All methods show the same part. The first seed of each method
-    is shown.
+    either direction; they are printed as options. All methods show the same part. The first seed that all methods
+    have is shown.
 
     \b
     aw figure runs -o figure.pdf

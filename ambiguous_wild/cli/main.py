@@ -196,7 +196,7 @@ def main() -> None:
         # Disk full, no permission, a file in place of a folder: the user can fix these.
         if error.errno == errno.ENOMEM:
             _fail(f"{error.filename or 'memory'}: {_LITTLE}")
-        _fail(disk_line(error))
+        _fail(disk_line(error, "change its permissions" * isinstance(error, PermissionError)))
     except (MemoryError, ImportError) as error:
         if isinstance(error, ImportError) and not re.search("allocate memory|failed to map", str(error)):
             raise

@@ -13,6 +13,7 @@ from typing import Any
 import click
 
 from ambiguous_wild.core.errors import AwError, similar_path
+from ambiguous_wild.core.names import name_from
 from ambiguous_wild.io.terminal import say
 
 # Heading -> options, of every command that has them.
@@ -308,11 +309,14 @@ def is_own_step() -> bool:
 
 
 def scene_name(photos: Path) -> str:
-    """Return the name of a scene of these photos: that of their folder, or of the one above images/."""
+    """Return the name of a scene of these photos: that of their folder, or of the one above images/.
+
+    No option of `aw try` and `aw masks` names it, so a folder of any name gives a valid one.
+    """
     named = photos.resolve()
     if named.name.lower() in PHOTO_FOLDERS and named.parent.name:
         named = named.parent
-    return named.stem
+    return name_from(named.stem)
 
 
 def style_of(output: Path | None, suffixes: Mapping[str, str], otherwise: str = "") -> str:

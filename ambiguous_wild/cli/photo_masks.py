@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -64,7 +65,8 @@ def command(
         check_output(place, new=True)
     if (source / "scene.json").is_file():
         raise AwError(
-            f"{source} is a scene: give its photos, or a run: aw bench --method refinesplat --scene {source}"
+            f"{source} is a scene: give its photos, or a run: aw bench --method refinesplat --scene "
+            f"{shlex.quote(str(source))}"
         )
     if source.is_file() or next(run_folders(source), None) is None:
         source = _trained(ctx, source, output, tool, inpaint, budget, threads)

@@ -185,8 +185,13 @@ def _seen(option: click.Option, word: str, folder: Path, here: Path) -> list[str
     if option.name not in ("methods", "mask"):
         return [word]
     from ambiguous_wild.harness.benchmark import split_methods
-    from ambiguous_wild.methods.graft import replace_reference_files
+    from ambiguous_wild.methods.graft import ALIASES, replace_reference_files
+    from ambiguous_wild.methods.registry import all_methods
 
+    method = all_methods().get(word)
+    named = word in ALIASES or (method is not None and not method.given_as)  # given: read from that folder
+    if option.name == "mask" and not named and (folder / word).is_dir():
+        return [str(moved(Path(word)))]
     names = split_methods(word, folder) if option.multiple else [word]
     return [replace_reference_files(name, moved) for name in names]
 

@@ -27,7 +27,7 @@ def check_name(kind: str, name: str) -> str:
     shown = quoted(stripped, 40)
     if not stripped:
         raise AwError(f"the {kind} is empty; give it at least one letter")
-    bad = next((c for c in stripped if c not in SIGNS and unicodedata.category(c)[0] not in "LMN"), None)
+    bad = next((c for c in stripped if not _allowed(c)), None)
     if bad is not None:
         signs = " ".join(SIGNS.strip())
         raise AwError(f"{kind} {shown} holds {bad!a}; use letters, digits, blanks and {signs}")
@@ -36,6 +36,16 @@ def check_name(kind: str, name: str) -> str:
     if size > LONGEST:
         raise AwError(f"{kind} {shown} has {size} bytes; at most {LONGEST} are allowed")
     return stripped
+
+
+def name_from(text: str) -> str:
+    """Return the text as a name that `check_name` accepts: other characters become "_", the end is cut."""
+    name = "".join(c if _allowed(c) else "_" for c in text).lstrip(".- ")
+    return name.encode()[:LONGEST].decode(errors="ignore").strip() or "scene"
+
+
+def _allowed(char: str) -> bool:
+    return char in SIGNS or unicodedata.category(char)[0] in "LMN"
 
 
 def spelling_key(name: str) -> str:

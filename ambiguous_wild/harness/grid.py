@@ -342,12 +342,13 @@ def choose_effects(
         AwError: an effect is unknown, or the plan is of another scene.
     """
     named = parse_effects(wanted)
+    again = f"'aw plan {shlex.quote(str(scene.root))}'"
     if plan is not None and plan.scene != scene.name:
-        raise AwError(f"the plan is of scene {plan.scene}, not of {scene.name}: run 'aw plan {scene.root}'")
+        raise AwError(f"the plan is of scene {plan.scene}, not of {scene.name}: run {again}")
     if plan is not None and plan.scene_hash and plan.scene_hash != scene_identity(scene):
         raise AwError(
             f"the plan is of another state of scene {scene.name} (its files, its split, or the size of its "
-            f"photos have changed): run 'aw plan {scene.root}'"
+            f"photos have changed): run {again}"
         )
     if wanted != "auto":
         asked = ChosenEffects(named, "" if wanted == "none" else wanted)

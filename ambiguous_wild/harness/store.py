@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -238,17 +239,18 @@ def impossible_values(result: RunResult) -> Iterator[tuple[str, float, str]]:
 
 def _no_run(root: Path) -> AwError:
     """Return the error for a folder without runs; it says what the folder holds, where that is clear."""
+    named = shlex.quote(str(root))
     within = [root, *(child for child in root.iterdir() if child.is_dir())]
     if (root / "scene.json").exists():
         return AwError(
-            f"{root} is a scene, not runs: 'aw bench --method NAME --scene {root} -o runs' makes some"
+            f"{root} is a scene, not runs: 'aw bench --method NAME --scene {named} -o runs' makes some"
         )
     if any(path.suffix.lower() in PHOTO_SUFFIXES for folder in within for path in folder.iterdir()):
         return AwError(
-            f"{root} holds photos, not runs: 'aw build-scene {root} -o scene' makes a scene of them, and "
+            f"{root} holds photos, not runs: 'aw build-scene {named} -o scene' makes a scene of them, and "
             "'aw bench --method NAME --scene scene -o runs' makes runs"
         )
-    return AwError(f"no run in {root}: 'aw bench --method NAME --scene SCENE -o {root}' makes one")
+    return AwError(f"no run in {root}: 'aw bench --method NAME --scene SCENE -o {named}' makes one")
 
 
 def run_folders(root: Path) -> Iterator[Path]:

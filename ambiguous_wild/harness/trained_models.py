@@ -159,7 +159,8 @@ def find_run_models(
         why = f" ({notes[0]})" if notes else ""
         scenes = (path for path in paths for part in ("scene.json", "sparse") if (path / part).exists())
         if scene := next(scenes, None):
-            why = f": {scene} is a scene, which 'aw bench --method NAME --scene {scene} -o runs' trains"
+            train = f"'aw bench --method NAME --scene {shlex.quote(str(scene))} -o runs'"
+            why = f": {scene} is a scene, which {train} trains"
         raise AwError(f"no finished run with a {MODEL} below {shortlist(map(str, paths))}{why}")
     if labels:
         shown = shown_names(labels, [t.model.label for t in trained])
@@ -326,6 +327,8 @@ def read_render_settings(config: ReadConfig) -> tuple[RenderSettings, str]:
         AwError: effects or background are damaged.
     """
     name, source = str(config.get("method", "")), str(config.get("source", ""))
+    if not name:
+        return RenderSettings(), "a run without its config.yaml is drawn as plain 3DGS: restore the file"
     options = config_section(config, "options")
     try:
         if is_reference(name):

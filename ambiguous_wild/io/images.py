@@ -316,6 +316,7 @@ def decode(
             f"{where} announces {size[0]}x{size[1]} px, more than the limit of {MAX_PIXELS // 1_000_000} "
             "megapixels; reduce it"
         )
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the caller's error is one line
     try:
         return cv2.imdecode(data, flags)
     except cv2.error:

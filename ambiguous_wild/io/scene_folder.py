@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import warnings
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
@@ -65,7 +66,7 @@ def load_scene(
     if root.is_file():
         raise AwError(f"{root} is a file, not a scene folder; give the folder: {root.parent}")
     if not root.is_dir():
-        hint = similar_path(root) or f"; 'aw build-scene PHOTOS -o {root}' makes one"
+        hint = similar_path(root) or f"; 'aw build-scene PHOTOS -o {shlex.quote(str(root))}' makes one"
         raise AwError(f"there is no scene folder {root}{hint}")
     read = read_scene_json(root)
     if read is not None and verify:
@@ -216,7 +217,7 @@ def _inside(name: str, root: Path) -> str:
     if not stays_below(name):
         raise AwError(
             f"{root} names a file outside itself: {name!r}; if its photos lie in it, "
-            f"'aw import {root} -o SCENE' finds them"
+            f"'aw import {shlex.quote(str(root))} -o SCENE' finds them"
         )
     return name
 
@@ -278,7 +279,7 @@ def model_folder(root: Path, listed: Collection[str] = ()) -> Path:
         raise AwError(f"{root} is no scene; did you mean {shortlist(inner, 3)}?")
     raise AwError(
         f"{root} is no scene: neither sparse/0 nor sparse holds a COLMAP model; "
-        f"if it holds photos, build one with 'aw build-scene {root} -o SCENE'"
+        f"if it holds photos, build one with 'aw build-scene {shlex.quote(str(root))} -o SCENE'"
     )
 
 
@@ -303,7 +304,8 @@ def _image_folder(root: Path, factor: int) -> Path:
         ]
         raise AwError(
             f"{root} has no images at factor {factor}; it has factor {', '.join(have) or 'none'}; "
-            f"pass one of those, or read it with 'aw import {root} -o SCENE --factor {max(factor, 1)}'"
+            f"pass one of those, or read it with 'aw import {shlex.quote(str(root))} -o SCENE --factor "
+            f"{max(factor, 1)}'"
         )
     return folder
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -189,7 +190,9 @@ def ablation(folder: Path, metrics: tuple[str, ...] = ()) -> list[Table]:
         shown = metrics or list(present)
         return _tables(data, [columns.get(key, measure(key)) for key in shown])
     except FileNotFoundError:
-        raise AwError(f"no {REPORT} in {folder}: 'aw ablate -o {folder}' writes it") from None
+        raise AwError(
+            f"no {REPORT} in {folder}: 'aw ablate -o {shlex.quote(str(folder))}' writes it"
+        ) from None
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise AwError(f"{path} is damaged ({error!r}): run 'aw ablate' again") from None
 

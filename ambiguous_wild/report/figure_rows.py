@@ -148,7 +148,7 @@ def runs_figure(
     errors: bool = False,
     masks: bool = False,
 ) -> RunsFigure:
-    """Choose photos and zooms, and read renders and masks of the first seed of each method.
+    """Choose photos and zooms, and read renders and masks of the first seed that all methods have.
 
     Args:
         runs: runs from `read_runs`.
@@ -200,10 +200,13 @@ def _groups(runs: Runs, scenes: Sequence[str]) -> tuple[list[_SceneRuns], list[s
     finished = asked[asked["status"] == "ok"]
     if finished.empty:
         raise AwError("no finished run to show; 'aw table' lists what is there")
-    first = finished.sort_values("seed").drop_duplicates(["scene", "method"])
+    having = finished.groupby(["scene", "seed"])["method"].transform("nunique")  # methods with this seed
+    best = finished.assign(lacking=-having).sort_values(["lacking", "seed"])
+    first = best.drop_duplicates(["scene", "method"])
     finished_methods = set(first["method"])
     methods = tuple(method for method in runs.rows() if method in finished_methods)
-    unfinished = sorted(set(asked["method"]) - finished_methods)
+    begun = {run.method for run in runs.incomplete if not scenes or run.scene in scenes}
+    unfinished = sorted((begun | set(asked["method"])) - finished_methods)
     owners: dict[str, list[str]] = {}
     for scene, method in zip(first["scene"].astype(str), first["method"].astype(str)):
         owners.setdefault(scene, []).append(method)
@@ -222,6 +225,9 @@ def _groups(runs: Runs, scenes: Sequence[str]) -> tuple[list[_SceneRuns], list[s
         rows = first[first["scene"] == scene].set_index("method").loc[list(methods)]
         if rows["scene_hash"].nunique() > 1:
             raise AwError(f"scene {scene!r} differs between these runs: run them again on one")
+        if rows["seed"].nunique() > 1:
+            seeds = ", ".join(f"{method} {seed}" for method, seed in rows["seed"].items())
+            notes.append(f"scene {scene}: no seed of which every method has a finished run; shown: {seeds}")
         folders = tuple(Path(str(folder)) for folder in rows["folder"])
         results = tuple(read_result(folder / RESULT) for folder in folders)
         groups.append(_SceneRuns(open_scene(folders[0]), folders, results, methods))

@@ -7,6 +7,7 @@ follows the edges of the photo by the guided filter (He et al., ECCV 2010).
 from __future__ import annotations
 
 import contextlib
+import shlex
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -301,7 +302,7 @@ def masks_of_run(folder: Path, scene_folder: Path | None = None) -> tuple[Path, 
     if len(absent) == len(paths):
         raise AwError(
             f"{run} has no masks: {method} makes none, or they had not begun when the run ended; train "
-            f"refinesplat: aw bench --method refinesplat --scene {scene.root} -o runs"
+            f"refinesplat: aw bench --method refinesplat --scene {shlex.quote(str(scene.root))} -o runs"
         )
     if absent:
         raise AwError(f"{run} lacks the masks of {shortlist(absent, 3)}: restore them, or train again")

@@ -40,6 +40,7 @@ class Statement:
 
 @dataclass(frozen=True)
 class _Run:
+    folder: Path
     result: RunResult
     config: RunConfig | None  # None: config.yaml is absent or damaged
     words: tuple[str, ...]  # of its command; empty without a config.yaml
@@ -57,7 +58,7 @@ def statement(folders: Sequence[Path]) -> Statement:
         folders: outputs of `aw bench` or `aw ablate`, or folders of them.
 
     Raises:
-        AwError: no such folder, or no finished run in it.
+        AwError: no such folder, no finished run in it, or a run and its copy.
     """
     runs, left_out, scenes = [], [], Scenes()
     for folder in find_runs(folders):
@@ -74,6 +75,12 @@ def statement(folders: Sequence[Path]) -> Statement:
         raise AwError(
             f"no finished run below {', '.join(map(str, folders))}: 'aw bench --method NAME --scene SCENE -o "
             "RUNS' makes one"
+        )
+    same = grouped(runs, lambda r: tuple(r.result[k] for k in ("scene", "method", "seed", "config_hash")))
+    for run, other in (copies[:2] for copies in same.values() if len(copies) > 1):
+        raise AwError(
+            f"{run.folder} and {other.folder} are the same run (method, scene, seed and settings), which "
+            "would be counted twice; leave one of them out"
         )
     sentences = [*_grid(runs), *_code(runs), *_machine(runs), *_data(runs), _repeats(runs)]
     sentences += _later(runs)
@@ -103,7 +110,7 @@ def _read(folder: Path, result: RunResult, scenes: Scenes) -> _Run:
     before = preparation(scene)
     if hidden_in(shlex.join([*words, *before])) is not None:  # readers paste it into a shell
         words = before = []
-    return _Run(result, given if config else None, tuple(words), tuple(before))
+    return _Run(folder, result, given if config else None, tuple(words), tuple(before))
 
 
 def _grid(runs: Sequence[_Run]) -> list[str]:

@@ -108,6 +108,7 @@ def render_pairs(
     frame = frame[frame["status"] == "ok"]
     for kind, asked in (("method", methods), ("scene", scenes)):
         check_names(kind, asked, sorted(set(frame[kind])))
+    frame = frame[frame["images"] > 0]
     if methods:
         frame = frame[frame["method"].isin(methods)]
     if scenes:
@@ -120,8 +121,8 @@ def render_pairs(
         pairs += _pairs_of_scene(str(scene), folders, truth)
     if not pairs:
         raise AwError(
-            f"{folder} has no scene with finished runs of two methods: there is nothing to compare; "
-            "run a second method with 'aw bench'"
+            f"{folder} has no scene with test photos and finished runs of two methods: there is nothing to "
+            "compare; run a second method with 'aw bench'"
         )
     return pairs
 

@@ -62,6 +62,19 @@ def test_a_closed_or_full_output_is_no_traceback(line: str, code: int, expected:
     assert done.returncode == code and expected in done.stderr and done.stderr.count("\n") <= 1, done.stderr
 
 
+def test_a_file_that_may_not_be_written_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    runs = save(tmp_path / "runs", fake_result("3dgs"))
+    monkeypatch.setattr("tempfile.mkstemp", refuse)
+    done = aw("table", runs, "-o", tmp_path / "t.tex")
+    assert done.returncode == 2
+    assert "t.tex: Permission denied; change its permissions, or choose another folder" in done.stderr
+
+
 @pytest.mark.parametrize(
     "line",
     [

@@ -65,6 +65,7 @@ MISTAKES = [
     (f"{BENCH} 3dgs --effects gone.json", "there is no plan gone.json"),
     (f"{BENCH} 3dgs --effects gone.json --effects auto", "gone.json is a plan, and auto"),
     ("bench --method 3dgs --scene nothing -o out", "there is no scene folder"),
+    ("bench --method 3dgs --scene x&y -o out", "'aw build-scene PHOTOS -o 'x&y'' makes one"),
     ("bench --method 3dgs --scene scenee -o out", "no scene folder scenee; did you mean scene?"),
     ("bench --method 3dgs --scene above -o out", "above is no scene; did you mean above/scene?"),
     ("try rwa -o out", "'rwa' does not exist; did you mean raw?"),

@@ -35,6 +35,7 @@ def project(scene: Path, tmp_path: Path) -> Path:
     (tmp_path / "own").mkdir()
     (tmp_path / "own" / "recipe.py").write_text(RECIPE)
     (tmp_path / "own" / "plugin.py").write_text(PLUGIN)
+    shutil.copytree(scene / "images", tmp_path / "sam")  # any pictures under the photos' names, as masks
     return tmp_path
 
 
@@ -70,6 +71,7 @@ STUDIES = [
     "--method own/recipe.py:build,3dgs@mask=refinesplat --max-gaussians 900 --set build.sh_degree=1",
     "--method mine --plugin own/plugin.py --mask truth --resolution full --set train.on_nonfinite=rollback",
     "--method 3dgs@mask=own/recipe.py:build --set build.sh_degree=1 --set train.probes=3 --device cpu",
+    "--method 3dgs --mask sam",
 ]
 
 
@@ -221,7 +223,6 @@ def test_the_method_of_a_run_in_a_file_must_be_given(project: Path, planned) -> 
         and "add --plugin FILE.py, --method FILE.py:RECIPE or --mask FOLDER" in done.stderr
     )
     assert planned(config, "--method", "own/recipe.py:build", "-o", "again", cwd=project) == first
-    shutil.copytree(project / "scene" / "images", project / "sam")  # any pictures under the photos' names
     words = ("--scene", "scene", "--iterations", 5, "--effects", "none")
     masked = planned("--method", "refinesplat", "--mask", "sam", *words, cwd=project)
     other = project / "masked.yaml"

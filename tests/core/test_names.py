@@ -1,7 +1,7 @@
 import pytest
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.names import check_name
+from ambiguous_wild.core.names import check_name, name_from
 
 
 @pytest.mark.parametrize(
@@ -60,3 +60,19 @@ def test_an_unfit_name_is_refused_in_one_printable_line(name):
     said = str(caught.value)
     assert "scene name" in said and len(said) < 250
     assert said.isprintable()
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("Garten im März", "Garten im März"),
+        ("Zürich — Tag 1: [Hof]", "Zürich _ Tag 1_ _Hof_"),
+        ("-.hidden", "hidden"),
+        ("..", "scene"),
+        ("\ud800 \x1b[31m", "_ __31m"),
+        ("é" * 60, "é" * 50),
+        ("a" * 99 + "é", "a" * 99),
+    ],
+)
+def test_any_text_becomes_a_fit_name(text, name):
+    assert name_from(text) == name == check_name("scene name", name)

@@ -64,11 +64,15 @@ def test_orientation_tag_is_ignored_for_scene_files(tmp_path):
     assert read_png_rgb(tmp_path / "o.jpg").shape == (4, 6, 3)
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG\r\n\x1a\n" + b"\0" * 40])
-def test_unreadable_file_names_itself(tmp_path, content):
+CUT = cv2.imencode(".png", np.zeros((9, 9), np.uint8))[1].tobytes()[:45]
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG\r\n\x1a\n" + b"\0" * 40, CUT])
+def test_unreadable_file_names_itself(tmp_path, capfd, content):
     (tmp_path / "bad.png").write_bytes(content)
     with pytest.raises(AwError, match=r"bad\.png"):
         read_png_rgb(tmp_path / "bad.png")
+    assert capfd.readouterr().err == ""  # the error is one line
 
 
 def test_missing_file_names_itself(tmp_path):

@@ -176,6 +176,20 @@ def test_a_method_whose_runs_failed_is_named(runs: Path, tmp_path: Path) -> None
         runs_figure(read_runs(tmp_path))
 
 
+def test_all_methods_show_the_same_seed(runs: Path, tmp_path: Path) -> None:
+    mine = write_run(tmp_path, runs / "porch", "mine", seed=1, noise=20.0)
+    with_both = read_runs(runs / "3dgs/porch", tmp_path)
+    (seed,) = {note for note in runs_figure(with_both).notes if "seed" in note}
+    assert seed.endswith("no seed of which every method has a finished run; shown: 3dgs 0, mine 1")
+    other = write_run(tmp_path, runs / "porch", "3dgs", seed=1, noise=20.0)
+    figure = runs_figure(read_runs(runs / "3dgs/porch", tmp_path))
+    shown = read_png_rgb(other / "renders/test" / figure.rows[0].photo)
+    assert np.array_equal(figure.rows[0].pictures[1], shown) and figure.notes == ()
+    (mine / "metrics.json").write_text("{")
+    notes = runs_figure(read_runs(tmp_path)).notes
+    assert notes == ("mine is left out: it has no finished run",)
+
+
 @pytest.mark.parametrize(
     ("asked", "message"),
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -127,6 +128,12 @@ def test_failures_and_runs_without_settings_are_named(runs, tmp_path: Path) -> N
     assert "The command of 1 of 3 runs is not known" in text
     (tmp_path / "none").mkdir()
     assert "no run in" in aw("statement", tmp_path / "none").stderr
+
+
+def test_a_copy_of_a_run_is_not_counted(runs, tmp_path: Path) -> None:
+    shutil.copytree(runs("3dgs") / "scene" / "3dgs", tmp_path / "runs" / "copy")
+    done = aw("statement", tmp_path / "runs")
+    assert done.returncode == 2 and "are the same run (method, scene, seed and settings)" in done.stderr
 
 
 def test_the_suffix_names_the_format(runs, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.study.make import PairQuestion, render_pairs, sample_questions
+from tests.harness.fake_runs import fake_result, save
 from tests.study.studies import METHODS, write_runs
 from tests.tiny_scene import TEST, TRAIN, write_tiny_scene
 
@@ -146,6 +147,8 @@ def test_what_cannot_be_is_said(made: tuple[Path, Path], tmp_path: Path) -> None
         runs, "-o", out, "--method", "refinesplit"
     )
     assert "two methods" in error(runs, "-o", out, "--method", "3dgs")
+    untested = save(tmp_path / "untested", *(fake_result(m, psnr=()) for m in ("3dgs", "mine")))
+    assert "has no scene with test photos and finished runs of two methods" in error(untested, "-o", out)
     assert "give RUNS" in error("--scene", scene, "-o", out, "--method", "3dgs")
     wide = runs / "yard/3dgs/seed0/renders/test" / TEST[0]
     cv2.imwrite(str(wide), np.zeros((48, 70, 3), np.uint8))

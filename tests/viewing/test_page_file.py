@@ -226,6 +226,7 @@ def test_a_stranger_s_method_name_imports_no_file(tmp_path: Path) -> None:
     look, note = read_render_settings(config)
     assert not (tmp_path / "ran").exists() and look == RenderSettings() and "--plugin" in note
     assert read_render_settings({"method": "3dgs", "options": {}, "effects": ["antialias"]})[0].antialias
+    assert read_render_settings({})[1].startswith("a run without its config.yaml is drawn as plain 3DGS")
     for damaged in ({"effects": 5}, {"scene": {"background": [0, 0]}}, {"scene": {"background": None}}):
         with pytest.raises(AwError, match="damaged"):
             read_render_settings({"method": "3dgs", "options": {}, **damaged})

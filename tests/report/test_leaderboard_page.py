@@ -200,15 +200,15 @@ def of_page(board: dict, dataset: str, script: str) -> Any:
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 def test_entries_that_differ_in_options_alone_are_told_apart_by_them() -> None:
     board = facts(read_board(Path(__file__).parents[2] / "leaderboard"), [], Reported(), [])
-    script = "console.log(JSON.stringify(groups('simulated').map((g) => [g.method, g.about])))"
-    entries = of_page(board, "simulated", script)
+    script = "console.log(JSON.stringify(groups('aw-sim').map((g) => [g.method, g.about])))"
+    entries = of_page(board, "aw-sim", script)
     length = "1000 iterations, effects auto"
     assert ["refinesplat-paper", f"{length}, features=labhog, instances=graph"] in entries
     assert ["robustsplat", f"{length}, features=efficientnet-lite0"] in entries
     assert ["3dgs", length] in entries
     for run in board["runs"]:
         run["reproduce"] = ""
-    entries = of_page(board, "simulated", script)
+    entries = of_page(board, "aw-sim", script)
     assert all("default options (" in about for method, about in entries if method == "robustsplat")
     assert len({tuple(entry) for entry in entries}) == len(entries)
 

@@ -67,7 +67,7 @@ def command(
     """
     from tqdm import tqdm
 
-    from ambiguous_wild.core.errors import AwError
+    from ambiguous_wild.core.errors import AwError, counted
     from ambiguous_wild.io.files import check_output, write_json
     from ambiguous_wild.io.scene_folder import load_scene, read_scene_json
     from ambiguous_wild.report import ambiguity_measure, ambiguity_page, ambiguity_sources, ambiguity_summary
@@ -106,4 +106,4 @@ def command(
     for line in ambiguity_summary.describe(facts):
         say(line, out=True)
     saved = ", scores saved in scene.json" if info is not None else ""
-    say(f"wrote {folder / 'index.html'} ({len(measured.photos)} photos){saved}", out=True)
+    say(f"wrote {folder / 'index.html'} ({counted(len(measured.photos), 'photo')}){saved}", out=True)

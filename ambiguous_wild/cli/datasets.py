@@ -101,7 +101,7 @@ def summary(info: ImportRecord, why: str) -> list[str]:
     measured = {"full": "whole test photos", "half": "right halves of test photos"}[protocol]
     return [
         f"layout {imported['layout']} ({why}), factor {info['factor']}, measured on {measured}",
-        f"{counts['train']} training and {counts['test']} test photos, {counts['cameras']} cameras, "
+        f"{counts['train']} training and {counts['test']} test photos, {counted(counts['cameras'], 'camera')}, "
         f"{counts['points']} points, {counts['points_seen_in_test_only']} of them seen in test photos only",
         *(f"note: {note}" for note in imported["notes"]),
         *(f"warning: {warning}" for warning in info["warnings"]),
@@ -292,12 +292,14 @@ def package_command(
         return
     size = f"{done.bytes / 1e6:.1f} MB"
     say(
-        f"wrote {output}: {len(done.scenes)} scenes, {size}, metadata taken out of {done.stripped} photos",
+        f"wrote {output}: {counted(len(done.scenes), 'scene')}, {size}, metadata taken out of "
+        f"{counted(done.stripped, 'photo')}",
         out=True,
     )
     if done.people is not None:
         say(
-            f"a person may be seen in {len(done.people)} photos: {shortlist(done.people) or 'none'}", out=True
+            f"a person may be seen in {counted(len(done.people), 'photo')}: {shortlist(done.people) or 'none'}",
+            out=True,
         )
     say("look for faces and number plates in every photo before release: the detectors miss most", out=True)
     if done.lacking:
@@ -329,7 +331,10 @@ def verify_command(package: Path, as_json: bool) -> None:
         return
     for warning in verified.warnings:
         say(f"warning: {warning}", out=True)
-    say(f"{package} is whole: {len(verified.scenes)} scenes, {verified.files} files", out=True)
+    say(
+        f"{package} is whole: {counted(len(verified.scenes), 'scene')}, {counted(verified.files, 'file')}",
+        out=True,
+    )
 
 
 def _print_captures(folder: Path, found: VerifiedCaptures, as_json: bool) -> None:

@@ -23,6 +23,7 @@ def command(runs: tuple[Path, ...], output: Path | None) -> None:
     aw statement runs
     aw statement runs -o reproducibility.tex
     """
+    from ambiguous_wild.core.errors import counted
     from ambiguous_wild.io.files import write_text
     from ambiguous_wild.report.reproducibility import statement, to_latex, to_markdown, to_text
 
@@ -33,4 +34,4 @@ def command(runs: tuple[Path, ...], output: Path | None) -> None:
         click.echo(text, nl=False)
     else:
         write_text(output, text)
-        click.echo(f"wrote {output}: {len(said.commands)} commands", err=True)
+        click.echo(f"wrote {output}: {counted(len(said.commands), 'command')}", err=True)

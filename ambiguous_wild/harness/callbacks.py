@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ambiguous_wild.core.errors import AwError, install_command
+from ambiguous_wild.core.errors import AwError, counted, install_command
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.cell import Cell, CellReport
@@ -117,7 +117,11 @@ def outcome_line(report: CellReport) -> str:
 
     cost = report.result["cost"]
     values = [float(v) for row in report.result["per_image"] if (v := row.get("psnr")) is not None]
-    parts = [f"PSNR {sum(values) / len(values):.2f} dB over {len(values)} test views"] if values else []
+    parts = (
+        [f"PSNR {sum(values) / len(values):.2f} dB over {counted(len(values), 'test view')}"]
+        if values
+        else []
+    )
     # an external program may not report all of these
     if (train_s := cost.get("train_s")) is not None:
         parts.append(f"{train_s:.0f} s training")

@@ -205,7 +205,11 @@ def _keep_stopped(cell: Cell, trainer: Trainer, truth: list[evaluate.TestPhoto])
             write_json(kept / "measured.json", {**state, "per_image": rows, "missing": missing})
     except KeyboardInterrupt:
         return f"{done}; {end}"
-    psnr = f": {np.mean([row['psnr'] for row in rows]):.2f} dB over {len(rows)} test views" if rows else ""
+    psnr = (
+        f": {np.mean([row['psnr'] for row in rows]):.2f} dB over {counted(len(rows), 'test view')}"
+        if rows
+        else ""
+    )
     return f"{done}{psnr}; model and renders in {folder / STOPPED}; {end}"
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -45,15 +44,7 @@ from ambiguous_wild.harness.training import FOLDER as FIRST_PASS
 from ambiguous_wild.harness.training import train_and_measure
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.corrections import CORRECTIONS
-from ambiguous_wild.io.files import (
-    atomic_dir,
-    folder_lock,
-    remove,
-    replace_folder,
-    sweep,
-    write_json,
-    write_text,
-)
+from ambiguous_wild.io.files import folder_lock, remove, sweep, write_json, write_text
 from ambiguous_wild.io.mask_reasons import FILE as REASONS
 from ambiguous_wild.methods.external_process import DONE, LOGS, WORK
 from ambiguous_wild.methods.references import error_location
@@ -64,12 +55,11 @@ ENVIRONMENT = "env.json"
 TRACEBACK = "traceback.txt"
 LOG_FILE = "log.txt"
 EFFECTS = "effects.json"
-LONGER = "longer"  # folder in a finished run, where it is continued until the longer run is finished
 # all that a run writes into its folder
 OURS = (
     RESULT, FAILED, TRACEBACK, CONFIG, CORRECTIONS, ENVIRONMENT, LOG_FILE, EFFECTS, FIRST_PASS, STOPPED, ROWS,
     WORK, LOGS, NONFINITE, "checkpoint", "export", "masks", "pictures", "point_cloud.ply", "renders",
-    REASONS, "timeline.csv", LONGER,
+    REASONS, "timeline.csv",
 )  # fmt: skip
 # Files that a run writes before there is anything worth keeping in its folder.
 _WORTHLESS = {CONFIG, CORRECTIONS, ENVIRONMENT, EFFECTS, FAILED, TRACEBACK, LOG_FILE}
@@ -101,8 +91,8 @@ def existing_outcome(
 
 def _continues(folder: Path, config: RunConfig) -> bool:
     """Return whether a run of this configuration goes on from the one in the folder."""
-    hashes = [earlier["config_hash"] for earlier in config.get("continued", [])]
-    return read_config(folder).get("config_hash") in hashes
+    earlier = config.get("continued", [])
+    return bool(earlier) and read_config(folder).get("config_hash") == earlier[-1]["config_hash"]
 
 
 def replaces_earlier(folder: Path, overwrite: Overwrite, config: RunConfig) -> bool:
@@ -272,21 +262,19 @@ def run_cell(cell: Cell, folder: Path, options: RunOptions, tick: Tick | None = 
         if place.exists() and options.overwrite == "never":
             return CellReport(place, "skipped")
         with folder_lock(place, f"aw bench --method {cell.method.name}"):
-            work = _prepare_folder(cell, place, options.overwrite)
-            if work is None:
+            if not _prepare_folder(cell, place, options.overwrite):
                 return CellReport(place, "kept")
             with logged_to(_log_file(place / LOG_FILE)):
                 LOG.debug("%s, configuration %s, version %s", run_name(cell), cell.identity[:12], __version__)
                 try:
                     if cell.method.program is not None:
-                        result = run_program(cell, work)
+                        result = run_program(cell, place)
                     else:
-                        result = train_and_measure(cell, work, options, tick)
+                        result = train_and_measure(cell, place, options, tick)
                     write_result(
-                        work / RESULT,
-                        {**result, **artefact_hashes(work, result["per_image"]), **provenance(cell)},
+                        place / RESULT,
+                        {**result, **artefact_hashes(place, result["per_image"]), **provenance(cell)},
                     )
-                    _replace_by_longer(place)
                 except (Exception, SystemExit) as error:
                     record_failure(cell, place, error)
                     LOG.debug("failed: %s", error_line(error))
@@ -309,44 +297,24 @@ def _log_file(path: Path) -> logging.Handler:
     return handler
 
 
-def _prepare_folder(cell: Cell, place: Path, overwrite: Overwrite) -> Path | None:
-    """Check or empty the run folder and write the settings.
-
-    Returns:
-        Where to train; None where the folder holds the finished run already.
-    """
-    folder = place
-    if place.exists():
-        _replace_by_longer(place)  # the call before was killed on the way
-        if check_folder(cell, place, overwrite):
+def _prepare_folder(cell: Cell, folder: Path, overwrite: Overwrite) -> bool:
+    """Check or empty the folder and write the settings; False where it holds the finished run already."""
+    if folder.exists():
+        if check_folder(cell, folder, overwrite):
             for name in OURS:  # what a user put beside them stays
-                remove(place / name)
-        elif is_finished(place):
-            if not _continues(place, cell.config):
-                return None
-            folder = place / LONGER
-            if not (folder / "checkpoint").exists():
-                with atomic_dir(folder / "checkpoint") as copied:
-                    shutil.copytree(place / "checkpoint", copied, dirs_exist_ok=True)
+                remove(folder / name)
+        elif is_finished(folder):
+            if not _continues(folder, cell.config):
+                return False
+            (folder / RESULT).unlink()  # it is no longer that of the checkpoint
     folder.mkdir(parents=True, exist_ok=True)
-    sweep(place)
+    sweep(folder)
     for name in (FAILED, TRACEBACK):
-        (place / name).unlink(missing_ok=True)
+        (folder / name).unlink(missing_ok=True)
     config = cell.config | {"config_hash": cell.identity}
     write_text(folder / CONFIG, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
     write_json(folder / ENVIRONMENT, environment(cell.device))
     cell.chosen.write(folder / EFFECTS)
     if cell.corrections is not None:
         cell.corrections.copy(folder / CORRECTIONS)
-    return folder
-
-
-def _replace_by_longer(place: Path) -> None:
-    """Put the longer run in the place of the one that it went on from, if it is finished."""
-    longer = place / LONGER
-    if is_finished(longer):
-        (place / RESULT).unlink(missing_ok=True)
-        # Settings first, so that the same command finds the longer run after a kill; what says finished last.
-        for path in sorted(longer.iterdir(), key=lambda p: (p.name != CONFIG, p.name == RESULT)):
-            (os.replace if path.is_file() else replace_folder)(path, place / path.name)
-        longer.rmdir()
+    return True

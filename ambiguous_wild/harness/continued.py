@@ -9,8 +9,8 @@ from pathlib import Path
 from ambiguous_wild.core import AwError
 from ambiguous_wild.core.config import from_plain
 from ambiguous_wild.harness.cell import Cell
-from ambiguous_wild.harness.cell_run import LONGER, different_keys, is_finished, may_continue
-from ambiguous_wild.harness.result_file import CONFIG, Continued
+from ambiguous_wild.harness.cell_run import different_keys, is_finished, may_continue
+from ambiguous_wild.harness.result_file import Continued
 from ambiguous_wild.harness.store import read_config
 from ambiguous_wild.io.corrections import CORRECTIONS, CorrectionsFile
 from ambiguous_wild.splat import checkpoint
@@ -69,7 +69,5 @@ def as_continued(cell: Cell, folder: Path) -> Cell:
                 "could act: give a larger --iterations or --budget"
             )
         return replace(same, train=from_plain(TrainConfig, config["train"], "train"))
-    if (folder / LONGER / CONFIG).is_file():  # it was continued before, and that was interrupted
-        return as_continued(cell, folder / LONGER)
     before: Continued = {"iteration": iteration, "config_hash": config["config_hash"]}
     return replace(same, continued=(*earlier, before))

@@ -11,7 +11,7 @@ import pytest
 from ambiguous_wild.cli import main
 from ambiguous_wild.core import AwError
 from ambiguous_wild.harness.benchmark import Callbacks, bench
-from ambiguous_wild.harness.store import checked_result, read_config, run_folders
+from ambiguous_wild.harness.store import run_folders
 from ambiguous_wild.harness.trained_models import find_run_models
 from ambiguous_wild.io.ply import read_splat_ply
 from ambiguous_wild.splat.training_loop import Stopped, defer_interrupt
@@ -44,9 +44,10 @@ def scene(tmp_path: Path) -> Path:
     return write_tiny_scene(tmp_path / "wall")
 
 
-def train(scene: Path, out: Path, callbacks: Callbacks | None = None, iterations: int = LENGTH):
-    options = {"effects": "none", "pictures": False, "overwrite": "longer"}
-    return bench("3dgs", scene, output=out, iterations=iterations, callbacks=callbacks, **options)
+def train(scene: Path, out: Path, callbacks: Callbacks | None = None):
+    return bench(
+        "3dgs", scene, output=out, iterations=LENGTH, effects="none", pictures=False, callbacks=callbacks
+    )
 
 
 def test_the_model_is_kept_and_the_same_command_goes_on(tmp_path: Path, scene: Path, ctrl_c: None) -> None:
@@ -69,20 +70,6 @@ def test_the_model_is_kept_and_the_same_command_goes_on(tmp_path: Path, scene: P
     plys = [Path(r.folder) / "point_cloud.ply" for r in (again, whole)]
     assert plys[0].read_bytes() == plys[1].read_bytes()
     assert not kept.exists()
-
-
-def test_the_shorter_run_stays_until_the_longer_one_is_finished(
-    tmp_path: Path, scene: Path, ctrl_c: None
-) -> None:
-    out = tmp_path / "runs"
-    run = train(scene, out, iterations=4).runs[0].folder
-    with pytest.raises(Stopped, match=f"model and renders in {run / 'longer' / 'stopped'}"):
-        train(scene, out, PressesAt(6), 8)
-    assert checked_result(run)["cost"]["iterations"] == 4
-    train(scene, out, iterations=10)  # goes on from 6
-    assert checked_result(run)["cost"]["iterations"] == 10
-    assert [c["iteration"] for c in read_config(run)["continued"]] == [4, 6]
-    assert not (run / "stopped").exists() and not (run / "longer").exists()
 
 
 def test_a_second_one_ends_at_once(

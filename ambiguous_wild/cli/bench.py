@@ -241,9 +241,9 @@ def command(
         else:
             # Before minutes of simulation.
             parts: dict[Any, str] = {"mask": mask} if mask else {}
-            wanted = check_request(methods, given["plugins"], parts, own, wanted_effects)
+            names = check_request(methods, given["plugins"], parts, own, wanted_effects)
             if given["overwrite"] not in ("never", "always"):
-                _check_poses(output, root, poses, wanted, given["seeds"])
+                _check_poses(output, root, poses, names, given["seeds"])
             prepared = _made(suite, root, poses, output)
         scenes = tuple(prepared.scenes.values())
         protocol = protocol or (suite.protocol if suite.simulated is None else None)

@@ -241,9 +241,7 @@ def command(
         else:
             # Before minutes of simulation.
             parts: dict[Any, str] = {"mask": mask} if mask else {}
-            names = check_request(methods, given["plugins"], parts, own, wanted_effects)
-            if given["overwrite"] not in ("never", "always"):
-                _check_poses(output, root, poses, names, given["seeds"])
+            check_request(methods, given["plugins"], parts, own, wanted_effects)
             prepared = _made(suite, root, poses, output)
         scenes = tuple(prepared.scenes.values())
         protocol = protocol or (suite.protocol if suite.simulated is None else None)
@@ -344,26 +342,6 @@ def _imported(suite: Suite, root: Path, poses: str, output: Path) -> PreparedSui
     if poses != "estimated":
         raise AwError(f"--poses {poses} with --suite {suite.name}: {_NO_TRUTH}")
     return prepare_suite(suite, root, output, say=say)
-
-
-def _check_poses(output: Path, root: Path, poses: str, methods: Sequence[str], seeds: Sequence[int]) -> None:
-    """Raise AwError where a finished run of the suite has the other poses: its scene is another one."""
-    from ambiguous_wild.harness.cell_run import is_finished
-    from ambiguous_wild.harness.store import config_section, read_config, run_folders
-    from ambiguous_wild.report.simulated_suite import EXACT_SCENES, SCENES
-
-    other = (root / (SCENES if poses == "truth" else EXACT_SCENES)).resolve()
-    for run in run_folders(output):
-        config = read_config(run)
-        scene, seed = (
-            Path(config_section(config, "scene").get("path", "")),
-            config_section(config, "train").get("seed"),
-        )
-        if scene.parent == other and config.get("method") in methods and seed in seeds and is_finished(run):
-            raise AwError(
-                f"{run} is a run with other poses, of {scene}: choose another -o, or replace it with "
-                "--overwrite always"
-            )
 
 
 def _made(suite: Suite, root: Path, poses: str, output: Path) -> PreparedSuite:

@@ -339,18 +339,13 @@ def check_request(
     parts: Mapping[GraftSlot, str],
     settings: Sequence[str],
     effects: Sequence[str],
-) -> list[str]:
-    """Check what does not need a scene, before one is made; arguments and errors as of `bench`.
-
-    Returns:
-        The names of the methods in results.
-    """
+) -> None:
+    """Check what does not need a scene, before one is made; arguments and errors as of `bench`."""
     from ambiguous_wild.harness.grid import resolved_options
 
     entries = find_methods(methods, plugins, parts, 1)
     _check_effects(effects, None, [], entries.values())
     resolved_options(list(entries.values()), settings)
-    return [entry.name for entry in entries.values()]
 
 
 def split_methods(text: str, folder: Path = Path()) -> list[str]:

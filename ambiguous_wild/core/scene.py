@@ -164,7 +164,7 @@ class Scene:
         return red, green, blue
 
     def truth_file(self, part: str, view: View) -> Path:
-        """Return where a part of a photo's exact truth lies, "distractor" or "shadow", if it has any."""
+        """Return where a part of a photo's exact truth, a folder of truth/, lies if the capture has it."""
         return self.root / "truth" / part / Path(view.name).with_suffix(".png")
 
     @cached_property

@@ -250,13 +250,13 @@ def consistent_pixels(scene: Scene) -> dict[str, np.ndarray] | str:
 
 
 # Each without the other regions, whose surfaces take longer.
-STATIC = {VALID: valid_pixels, CONSISTENT: consistent_pixels}
+FIND_STATIC = {VALID: valid_pixels, CONSISTENT: consistent_pixels}
 
 
 def _find_regions(scene: Scene) -> Regions:
     pixels: dict[str, dict[str, np.ndarray]] = {}
     missing: dict[str, str] = {}
-    for metric, find in STATIC.items():
+    for metric, find in FIND_STATIC.items():
         found = find(scene)
         if isinstance(found, str):
             missing[metric] = found

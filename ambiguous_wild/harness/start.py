@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -50,6 +51,10 @@ def start_file(path: Path) -> StartFile:
     Raises:
         AwError: the file cannot be read, or is of another kind.
     """
+    if path.name == "meta.json":  # its hash is not that of the textures
+        raise AwError(
+            f"{path} is an unpacked SOG: 'aw export {shlex.quote(str(path))} -o start.ply' packs it"
+        )
     content = _read(path)
     is_splats = isinstance(content, SplatFile)
     count = len(content.gaussians["means"]) if isinstance(content, SplatFile) else len(content[0])

@@ -10,7 +10,7 @@ import io
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -98,32 +98,40 @@ def encode_sog(
     return [file.getvalue()]
 
 
-def pack_sog(meta: Path) -> bytes:
-    """Return the file of an unpacked SOG: its meta.json and the textures beside it.
-
-    Raises:
-        AwError: a file cannot be read.
-    """
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        for path in (meta, *meta.parent.glob("*.webp")):
-            archive.writestr(path.name, read_bytes(path, _MAX_TEXTURE))
-    return file.getvalue()
-
-
 def decode_sog(data: bytes, path: Path | str) -> SplatFile:
     """Read a SOG file of version 2.
 
     Raises:
         AwError: no SOG of version 2, or damaged.
     """
-    try:
+
+    def read(name: str) -> bytes:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            meta = json.loads(_member(archive, "meta.json"))
-            if meta["version"] != 2:
-                raise AwError(f"{path} is SOG of version {meta['version']!r}; this reads version 2")
-            flag = meta.get("antialias") is True
-            return SplatFile(_decode(archive, meta), transform_from(meta.get("asset")), flag)
+            if archive.getinfo(name).file_size > _MAX_TEXTURE:
+                raise ValueError(f"{name} is larger than a texture can be")
+            return archive.read(name)
+
+    return _decoded(read, path)
+
+
+def read_unpacked_sog(meta: Path) -> SplatFile:
+    """Read an unpacked SOG by its meta.json; errors as of `decode_sog`, or a file cannot be read."""
+
+    def read(name: str) -> bytes:
+        if Path(name).name != name:
+            raise ValueError(f"{name!r} is no file beside it")
+        return read_bytes(meta.with_name(name), _MAX_TEXTURE)
+
+    return _decoded(read, meta)
+
+
+def _decoded(read: Callable[[str], bytes], path: Path | str) -> SplatFile:
+    try:
+        meta = json.loads(read("meta.json"))
+        if meta["version"] != 2:
+            raise AwError(f"{path} is SOG of version {meta['version']!r}; this reads version 2")
+        flag = meta.get("antialias") is True
+        return SplatFile(_decode(read, meta), transform_from(meta.get("asset")), flag)
     except (
         zipfile.BadZipFile,
         zlib.error,
@@ -136,11 +144,11 @@ def decode_sog(data: bytes, path: Path | str) -> SplatFile:
         raise AwError(f"{path} is no SOG of version 2, or damaged: {error}") from None
 
 
-def _decode(archive: zipfile.ZipFile, meta: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _decode(read: Callable[[str], bytes], meta: Mapping[str, Any]) -> dict[str, np.ndarray]:
     n = int(meta["count"])
 
     def pixels(part: str, index: int = 0) -> np.ndarray:
-        return _read_webp(_member(archive, str(meta[part]["files"][index]))).reshape(-1, 4)
+        return _read_webp(read(str(meta[part]["files"][index]))).reshape(-1, 4)
 
     low, high = (np.asarray(meta["means"][end], np.float64) for end in ("mins", "maxs"))
     fixed = pixels("means")[:n, :3].astype(np.int64) | (pixels("means", 1)[:n, :3].astype(np.int64) << 8)
@@ -244,9 +252,3 @@ def _read_webp(data: bytes) -> np.ndarray:
     if image.shape[2] == 3:
         image = np.dstack([image, np.full(image.shape[:2], 255, np.uint8)])
     return image[:, :, [2, 1, 0, 3]]
-
-
-def _member(archive: zipfile.ZipFile, name: str) -> bytes:
-    if archive.getinfo(name).file_size > _MAX_TEXTURE:
-        raise ValueError(f"{name} is larger than a texture can be")
-    return archive.read(name)

@@ -14,7 +14,7 @@ from ambiguous_wild.io.compressed_ply import decode_compressed_ply, encode_compr
 from ambiguous_wild.io.files import write_bytes
 from ambiguous_wild.io.gltf import decode_gltf, encode_gltf
 from ambiguous_wild.io.ply import decode_ply, encode_ply, has_chunks
-from ambiguous_wild.io.sog import decode_sog, encode_sog, pack_sog
+from ambiguous_wild.io.sog import decode_sog, encode_sog, read_unpacked_sog
 from ambiguous_wild.io.splat_arrays import SH_C0, Arrays, SplatFile, finite, logit, morton_order
 from ambiguous_wild.io.spz import decode_spz, encode_spz
 from ambiguous_wild.io.untrusted import read_bytes
@@ -83,9 +83,12 @@ def read_splats(path: Path) -> SplatFile:
     Raises:
         AwError: no such file, another format, damaged, no Gaussian is finite, or one is too far for float32.
     """
-    data = pack_sog(path) if path.name == "meta.json" else read_bytes(path)
+    unpacked = path.name == "meta.json"
+    data = b"" if unpacked else read_bytes(path)
     form = next((form for form in FORMATS.values() if form.starts(data)), None)
-    if form is not None:
+    if unpacked:
+        splats = read_unpacked_sog(path)
+    elif form is not None:
         splats = form.decode(data, path)
     elif path.suffix.lower() == ".splat":  # without a magic number
         splats = _decode_dot_splat(data, path)

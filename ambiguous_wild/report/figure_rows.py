@@ -107,9 +107,9 @@ class _SceneRuns:
         """The pixels that `metric` measures, [H, W] bool by the name of a test photo; absent: all."""
         if self.metric == "psnr":
             return {}
-        from ambiguous_wild.harness.regions import STATIC  # imports torch
+        from ambiguous_wild.harness.regions import FIND_STATIC  # imports torch
 
-        found = STATIC[self.metric](self.scene)
+        found = FIND_STATIC[self.metric](self.scene)
         return {} if isinstance(found, str) else found
 
     def notes(self) -> list[str]:

@@ -9,6 +9,7 @@ import shlex
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import cast
 
@@ -76,12 +77,9 @@ def statement(folders: Sequence[Path]) -> Statement:
             f"no finished run below {', '.join(map(str, folders))}: 'aw bench --method NAME --scene SCENE -o "
             "RUNS' makes one"
         )
-    same = grouped(runs, lambda r: tuple(r.result[k] for k in ("scene", "method", "seed", "config_hash")))
-    for run, other in (copies[:2] for copies in same.values() if len(copies) > 1):
-        raise AwError(
-            f"{run.folder} and {other.folder} are the same run (method, scene, seed and settings), which "
-            "would be counted twice; leave one of them out"
-        )
+    for run, other in combinations(runs, 2):
+        if run.result == other.result:
+            raise AwError(f"{other.folder} is a copy of {run.folder}, which would count twice: leave it out")
     sentences = [*_grid(runs), *_code(runs), *_machine(runs), *_data(runs), _repeats(runs)]
     sentences += _later(runs)
     if left_out:

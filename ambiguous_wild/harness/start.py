@@ -52,9 +52,8 @@ def start_file(path: Path) -> StartFile:
         AwError: the file cannot be read, or is of another kind.
     """
     if path.name == "meta.json":  # its hash is not that of the textures
-        raise AwError(
-            f"{path} is an unpacked SOG: 'aw export {shlex.quote(str(path))} -o start.ply' packs it"
-        )
+        export = f"aw export {shlex.quote(str(path))} --format ply -o start"
+        raise AwError(f"{path} is an unpacked SOG: give --start the file that '{export}' writes")
     content = _read(path)
     is_splats = isinstance(content, SplatFile)
     count = len(content.gaussians["means"]) if isinstance(content, SplatFile) else len(content[0])

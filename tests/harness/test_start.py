@@ -126,7 +126,7 @@ def test_what_a_run_cannot_start_from_is_refused_before_anything_is_made(scene, 
         (other, r"other\.ply lies around .* at most 0% of its points"),
         (tmp_path / "no.ply", "no x, y and z"),
         (Path(__file__), "no splat file"),
-        (tmp_path / "meta.json", "unpacked SOG: 'aw export"),
+        (tmp_path / "meta.json", "unpacked SOG.*'aw export"),
         (tmp_path / "gone.ply", "cannot read"),
     ):
         with pytest.raises(AwError, match=message):

@@ -212,6 +212,7 @@ TABLES: dict[str, dict[str, Callable[[], list[str]]]] = {
     "README.md": {"means": means},
     "docs/datasets.md": {"suite": suite},
     "docs/refinesplat.md": {"scenes": scenes},
+    "docs/training.md": {"lengths": lengths},
     "docs/baselines.md": {"baselines": baselines},
     "docs/leaderboard.md": {"agreement": agreement},
 }

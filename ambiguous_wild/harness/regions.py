@@ -249,15 +249,16 @@ def consistent_pixels(scene: Scene) -> dict[str, np.ndarray] | str:
     return "no pixel of a test photo looks as train photos show its surface"
 
 
-# Each without the other regions, whose surfaces take longer.
-FIND_STATIC = {VALID: valid_pixels, CONSISTENT: consistent_pixels}
+def static_pixels(scene: Scene, metric: str) -> dict[str, np.ndarray] | str:
+    """Return the pixels of `VALID` or `CONSISTENT` without the other regions, whose surfaces take longer."""
+    return valid_pixels(scene) if metric == VALID else consistent_pixels(scene)
 
 
 def _find_regions(scene: Scene) -> Regions:
     pixels: dict[str, dict[str, np.ndarray]] = {}
     missing: dict[str, str] = {}
-    for metric, find in FIND_STATIC.items():
-        found = find(scene)
+    for metric in (VALID, CONSISTENT):
+        found = static_pixels(scene, metric)
         if isinstance(found, str):
             missing[metric] = found
         else:

@@ -107,9 +107,9 @@ class _SceneRuns:
         """The pixels that `metric` measures, [H, W] bool by the name of a test photo; absent: all."""
         if self.metric == "psnr":
             return {}
-        from ambiguous_wild.harness.regions import FIND_STATIC  # imports torch
+        from ambiguous_wild.harness.regions import static_pixels  # imports torch
 
-        found = FIND_STATIC[self.metric](self.scene)
+        found = static_pixels(self.scene, self.metric)
         return {} if isinstance(found, str) else found
 
     def notes(self) -> list[str]:

@@ -1,14 +1,14 @@
 """The published figures of quality, made anew: captures, scenes, runs, board. Stops and goes on.
 
     python benchmarks/publish.py --work DIR [--data DIR] [--seeds 0 1 2] [--methods ...] [--iterations 1000]
-        [--jobs 2] [--only NAME...] [--set METHOD.OPTION=VALUE...]
+        [--jobs 2] [--only NAME...] [--set METHOD.OPTION=VALUE...] [--large]
 
 Captures: the suite aw-sim; distractors pasted on the photos of --data before structure from motion (`aw
 composite`); and, if --only names them, photos of --data in which something moves, with polygons that a person
 drew around it (movers.json, px of the file): in train photos for the scores of masks, in test photos so that
 PSNR leaves it out (`psnr_valid`). --data holds a folder of photos for each, and cutouts/; without it only the
-suite is made. --methods all: every method of `aw methods`. All methods of a scene train with the effects of
-its plan.
+suite is made. --large: photos of twice the side, about 480 px, from aw-sim-large and the same composites.
+--methods all: every method of `aw methods`. All methods of a scene train with the effects of its plan.
 Checked runs go to the board, leaderboard/measured, then `python benchmarks/figures.py` writes the tables; the
 table of photos with polygons goes to results/movers.md.
 """
@@ -30,7 +30,7 @@ from job_queue import Run, aw, count, exit_code, run_all, seed, write_section
 
 from ambiguous_wild.core import AwError
 from ambiguous_wild.datasets.suites import MEASURED as FACTS
-from ambiguous_wild.datasets.suites import get_suite
+from ambiguous_wild.datasets.suites import Suite, get_suite
 from ambiguous_wild.io.files import atomic_dir, write_text
 from ambiguous_wild.io.images import read_gray, write_png
 from ambiguous_wild.io.photos import read_photo
@@ -42,7 +42,7 @@ from ambiguous_wild.report.ambiguity_summary import semantic_metric
 from ambiguous_wild.report.simulated_suite import prepare_simulated
 
 ROOT = Path(__file__).parents[1]
-SUITE = get_suite("aw-sim")
+SUITE, LARGE = get_suite("aw-sim"), get_suite("aw-sim-large")
 BASES = {"seneca": 4, "monstree": 4, "sceaux": 4, "tiny_aerial": 2}  # downsampling to 240 px and more
 KINDS = ("cutouts", "patches")
 MOVERS = ROOT / "benchmarks" / "movers.json"  # capture: photo: polygons [[x, y], ...]
@@ -78,17 +78,22 @@ class Capture:
         return scene
 
 
-def real_captures(data: Path) -> Iterator[Capture]:
+def real_captures(data: Path, large: bool) -> Iterator[Capture]:
     """Composites, and captures in which something moves."""
+    scale, suffix = (2, "-large") if large else (1, "")
     for base, factor in BASES.items():
         for kind in KINDS:
             words = ("composite", str(data / base), "--seed", str(WORLD))
             words += ("--cutouts", str(data / "cutouts")) if kind == "cutouts" else ("--patches",)
-            yield Capture(
-                f"{base}-{kind}", factor, "composites", lambda raw, words=words: aw(*words, "-o", str(raw))
-            )
+            make = partial(make_composite, words)
+            yield Capture(f"{base}-{kind}", factor // scale, f"composites{suffix}", make)
     for name, factor in DRAWN.items():
-        yield Capture(name, factor, "movers", partial(copy_with_polygons, data / name, name))
+        copy = partial(copy_with_polygons, data / name, name)
+        yield Capture(name, factor // scale, f"movers{suffix}", copy)
+
+
+def make_composite(words: Sequence[str], raw: Path) -> None:
+    aw(*words, "-o", str(raw))
 
 
 def copy_with_polygons(photos: Path, name: str, raw: Path) -> None:
@@ -112,10 +117,10 @@ def leave_out_polygons(scene: Path) -> None:
             write_png(scene / "masks" / "test" / mask, 255 - read_gray(drawn))
 
 
-def suite_scenes(names: Sequence[str], work: Path) -> dict[str, Path]:
-    """The scene folders of some captures of the suite; they are made if they are not there."""
-    some = replace(SUITE, tables={"chosen": list(names)})
-    return prepare_simulated(some, work / SUITE.dataset, say=print).scenes if names else {}
+def suite_scenes(suite: Suite, names: Sequence[str], work: Path) -> dict[str, Path]:
+    """The scene folders of some captures of a suite; they are made if they are not there."""
+    some = replace(suite, tables={"chosen": list(names)})
+    return prepare_simulated(some, work / suite.dataset, say=print).scenes if names else {}
 
 
 def record_ambiguity(scenes: Mapping[str, Path], work: Path) -> None:
@@ -168,6 +173,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--set", nargs="+", default=[], metavar="METHOD.OPTION=VALUE")
     parser.add_argument("--seeds", nargs="+", type=seed, default=[0, 1, 2])
     parser.add_argument("--iterations", type=count, default=LENGTH)
+    parser.add_argument("--large", action="store_true", help="photos of twice the side")
     parser.add_argument("--jobs", type=count, default=2, help="runs at a time")
     parser.add_argument("--board", type=Path, default=ROOT / "leaderboard")
     args = parser.parse_args(words)
@@ -175,8 +181,11 @@ def main(words: Sequence[str] | None = None) -> int:
         args.methods = [*all_methods()]
     # runs of another length or with other options have their own folder
     length = [] if args.iterations == LENGTH else [str(args.iterations)]
+    suite = SUITE
+    if args.large:
+        suite, args.work = LARGE, args.work / "large"
     args.runs = args.work / "-".join(["runs", *length, *args.set])
-    real = {capture.name: capture for capture in real_captures(args.data)} if args.data else {}
+    real = {capture.name: capture for capture in real_captures(args.data, args.large)} if args.data else {}
     known = [*SUITE.scenes, *real]
     if unknown := set(args.only or ()) - {*known}:
         raise AwError(f"--only {min(unknown)}: no such capture; there are {', '.join(known)}")
@@ -184,8 +193,9 @@ def main(words: Sequence[str] | None = None) -> int:
     chosen = args.only or [name for name in known if name not in DRAWN]
     if idle := {option.partition(".")[0] for option in args.set} - {*args.methods}:
         raise AwError(f"--set {min(idle)}: --methods does not have it")
-    scenes = suite_scenes([name for name in chosen if name in SUITE.scenes], args.work)
-    record_ambiguity(scenes, args.work)
+    scenes = suite_scenes(suite, [name for name in chosen if name in suite.scenes], args.work)
+    if not args.large:
+        record_ambiguity(scenes, args.work)
     scenes |= {name: real[name].build(args.work) for name in chosen if name in real}
     failed = run_all([run for scene in scenes.values() for run in runs_of(scene, args)], args.jobs)
     if drawn := [name for name in scenes if name in DRAWN]:
@@ -194,7 +204,7 @@ def main(words: Sequence[str] | None = None) -> int:
         if name in DRAWN:
             continue
         # photos of --data may not be passed on
-        dataset, images = (real[name].dataset, "0") if name in real else (SUITE.dataset, "1")
+        dataset, images = (real[name].dataset, "0") if name in real else (suite.dataset, "1")
         add = ("leaderboard", "add", str(args.runs / name), "--board", str(args.board))
         print(aw(*add, "--dataset", dataset, "--images", images, "--overwrite"), end="", flush=True)
     for line in failed:

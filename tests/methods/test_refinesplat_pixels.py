@@ -32,6 +32,7 @@ from ambiguous_wild.methods.refinesplat.structure import (
 from tests.methods.on_device import noise, number, tensor
 
 H, W, FOCAL, PLANE = 40, 64, 60.0, 5.0
+GREY_PHOTO = np.full((H, W, 3), 0.5, np.float32)
 
 
 def camera(x: float) -> Camera:
@@ -41,7 +42,7 @@ def camera(x: float) -> Camera:
 
 
 def plain(count: int) -> list[np.ndarray]:
-    return [np.full((H, W, 3), 0.5, np.float32)] * count
+    return [GREY_PHOTO] * count
 
 
 def others_of(cameras, photos, config=None, surfaces=()) -> MultiViewStore:
@@ -53,10 +54,10 @@ def store(others: MultiViewStore, view: int, evidence: np.ndarray, depth: np.nda
     others.store(view, evidence, others.halved(view, depth))
 
 
-def asked(others: MultiViewStore, view: int) -> MultiViewEvidence:
-    """What the others say about the surface that the view stored, as arrays."""
-    found = others.query(view, others.depth.of(view)[0])
-    return MultiViewEvidence(*(x.numpy() for x in (found.evidence, found.weight, found.coverage)))
+def asked(others: MultiViewStore, view: int, image: np.ndarray = GREY_PHOTO) -> MultiViewEvidence:
+    """What the others say about the surface that the view stored and its render shows, as arrays."""
+    found = others.query(view, others.depth.of(view)[0], tensor(image))
+    return MultiViewEvidence(*(x.numpy() for x in dataclasses.astuple(found)))
 
 
 def pixel_evidence(photos, cameras, surfaces=(), **changes) -> PixelEvidence:
@@ -130,7 +131,7 @@ def test_a_surface_at_another_depth_or_outside_says_nothing():
     other_views = others_of(cameras, plain(2))
     store(other_views, 0, np.ones((H, W)), np.full((H, W), PLANE))
     assert np.isnan(asked(other_views, 0).evidence).all()  # nobody else stored anything
-    assert others_of(cameras[:1], plain(1)).query(0, torch.ones(H // 2, W // 2)) is None
+    assert others_of(cameras[:1], plain(1)).query(0, torch.ones(H // 2, W // 2), tensor(GREY_PHOTO)) is None
     store(other_views, 1, np.ones((H, W)), np.full((H, W), 2 * PLANE))
     assert np.isnan(asked(other_views, 0).evidence).all()
     store(other_views, 1, np.ones((H, W)), np.full((H, W), 1.05 * PLANE))
@@ -159,8 +160,8 @@ def test_discount_by_hand():
     evidence = torch.full((4, 6), 10.0)
     said, whole = torch.full((2, 3), 0.6), torch.ones(2, 3)  # 6 units: 4 above what is free
 
-    def left(said, weight, coverage=whole):
-        return discount(evidence, MultiViewEvidence(said, weight, coverage), number(0.1), config)
+    def left(said, weight, coverage=whole, confirmed=whole):
+        return discount(evidence, MultiViewEvidence(said, weight, coverage, confirmed), number(0.1), config)
 
     assert np.allclose(left(said, whole), 10.0 / np.sqrt(1 + 2 * 4))
     assert np.allclose(left(said, 0.5 * whole), 10.0 / np.sqrt(1 + 2 * 2))
@@ -168,6 +169,43 @@ def test_discount_by_hand():
         assert torch.equal(left(said_, weight), evidence)
     assert discount(evidence, None, number(0.1), config) is evidence
     assert np.allclose(left(said, whole, 0.5 * whole), 5.0 / np.sqrt(1 + 2 * 4))
+    assert np.allclose(
+        left(said, whole, 0.5 * whole, 0 * whole), 5.0 * config.unconfirmed / np.sqrt(1 + 2 * 4)
+    )
+
+
+def test_a_render_is_confirmed_where_another_photo_shows_it():
+    """The right half of the render is not what stands in the photos; nor with exposure between them."""
+    cameras = [camera(0.02 * i) for i in range(3)]
+    wrong = GREY_PHOTO.copy()
+    wrong[:, W // 2 :] = 0.9
+    points = [np.full((H // 2, W // 2), 1 / PLANE, np.float32)] * 3
+    for others, image, depths in (
+        (others_of(cameras, plain(3)), wrong, (PLANE, PLANE, PLANE)),
+        (others_of(cameras, [GREY_PHOTO + 0.2, *plain(2)]), wrong + 0.2, (PLANE, PLANE, PLANE)),
+        # renders disagree about the surface, the sparse points know it
+        (others_of(cameras, plain(3), surfaces=points), wrong, (9, 18, 27)),
+    ):
+        for view, depth in enumerate(depths):
+            store(others, view, np.ones((H, W)), np.full((H, W), depth))
+        confirmed = asked(others, 0, image).confirmed
+        assert (confirmed[:, : W // 4 - 2] == 1).all() and (confirmed[:, W // 4 + 2 :] == 0).all()
+    untested = others_of(cameras, plain(3), MultiViewConfig(agree=0.0))
+    for view in range(3):
+        store(untested, view, np.ones((H, W)), np.full((H, W), PLANE))
+    assert (asked(untested, 0, wrong).confirmed[:, :-4] == 1).all()
+
+
+def test_a_masked_instance_is_masked_where_no_other_photo_looks():
+    labels = np.zeros((H, W), np.int32)
+    labels[10:, 5:20], labels[10:, 40:55] = 1, 2
+    values = np.zeros((H, W), np.float32)
+    values[10:30, 5:20] = values[24:30, 40:55] = 100.0  # all of one and a third of the other's upper part
+    unseen = np.zeros((H, W), bool)
+    unseen[30:] = True
+    found = masks_of(values, labels, MaskConfig(use_local=False), ceiling=20.0, unseen=unseen)
+    masked = found.keep.numpy() < 0.5
+    assert masked[10:, 5:20].all() and not masked[30:, 20:].any() and masked[26, 45]
 
 
 def test_views_that_show_another_colour_have_no_word():
@@ -280,14 +318,14 @@ def test_hard_surfaces_are_forgiven_and_what_one_view_shows_is_not():
 
 def test_a_surface_that_too_few_others_see_is_no_evidence():
     """A render with a wrong depth, and no sparse points: no other photo could teach what is masked."""
-    cameras, photos = [camera(0.05 * i) for i in range(4)], plain(4)
+    cameras, (render, *others) = [camera(0.05 * i) for i in range(4)], plain(4)
+    photos = [np.full((H, W, 3), 0.9, np.float32), *others]  # the first shows a distractor
     for least, wrong in ((2, 0.0), (0, 1.0)):
         pixels = pixel_evidence(photos, cameras, multiview=MultiViewConfig(seen_by=least))
         for view in range(4):
-            looked(pixels, view, photos[view], store=True)
-        off = np.full((H, W, 3), 0.9, np.float32)
-        right = looked(pixels, 0, off, store=False)[H // 2, W // 2]
-        far = looked(pixels, 0, off, depth=3 * PLANE, store=False)[H // 2, W // 2]
+            looked(pixels, view, render, store=True)
+        right = looked(pixels, 0, render, store=False)[H // 2, W // 2]
+        far = looked(pixels, 0, render, depth=3 * PLANE, store=False)[H // 2, W // 2]
         assert right > 0.5 and far == pytest.approx(wrong * right)
 
 

@@ -39,6 +39,7 @@ from ambiguous_wild.splat.backend import backend_of
 if TYPE_CHECKING:
     from ambiguous_wild.splat.step import Step, TrainData
 
+WHOLE = 0.6  # share of an instance's maskable pixels from which its other pixels are masked too
 PRICE = 3.0  # cost of a masked pixel, in MADs above the median distance, if `disagree` is off
 
 
@@ -109,11 +110,14 @@ class InstanceLabels:
         self.shapes = [label.shape for label in labels]
         counts = [len(s) for s in static]
         self.most = max([*counts, 1])
-        clean = [
-            np.where((label > 0) & (True if s is None else s), label, 0).astype(label_dtype(self.most))
-            for label, s in zip(labels, seen, strict=True)
-        ]
+        whole = [np.where(label > 0, label, 0).astype(label_dtype(self.most)) for label in labels]
+        clean = [w if s is None else np.where(s, w, 0) for w, s in zip(whole, seen, strict=True)]
         self._of_pixel = [torch.from_numpy(label.ravel()).to(device) for label in clean]
+        # also of pixels that may not be judged
+        self._whole = [
+            judged if w is c else torch.from_numpy(w.ravel()).to(device)
+            for judged, w, c in zip(self._of_pixel, whole, clean)
+        ]
         areas = np.full((len(clean), self.most), np.nan)
         flags = np.zeros((len(clean), self.most), bool)
         for view, (label, count) in enumerate(zip(clean, counts)):
@@ -143,6 +147,24 @@ class InstanceLabels:
     def on_pixels(self, view: int, values: Tensor, shape: tuple[int, ...]) -> Tensor:
         """Return the value of each instance [K] at its pixels [H, W]; 0 outside of instances."""
         return F.pad(values, (1, 0)).index_select(0, self.of_pixel(view)).view(shape)
+
+    def beyond(self, view: int, masked: Tensor, maskable: Tensor) -> Tensor:
+        """Return the pixels outside of `maskable` of instances that are masked almost whole, [H, W] bool.
+
+        A distractor does not end where the other photos' frames do: its rest would be learnt.
+
+        Args:
+            view: index of the photo.
+            masked: [H, W] bool.
+            maskable: pixels that may be masked, [H, W] bool.
+        """
+        labels, backend = self._whole[view].int(), backend_of(masked.device)
+        hit, all_ = (
+            backend.label_sums(labels, self.most + 1, m.double().flatten()) for m in (masked, maskable)
+        )
+        taken = (hit > 0) & (hit >= WHOLE * all_)
+        taken[:1] = False
+        return taken.index_select(0, labels).view(masked.shape) & ~maskable
 
 
 def label_dtype(most: int) -> type[np.uint8 | np.int32]:
@@ -219,6 +241,7 @@ def make_masks(
     final = final_mask(final, config, judging)
     if maskable is not None:
         final = final & maskable
+        final = final | labels.beyond(view, final, maskable)
     if moving is not None:
         final = final | moving
     return PhotoMasks(local, global_, (~final).float(), means, distances, cut, pool)

@@ -6,6 +6,10 @@ through the render's depth. Without the discount, masked pixels are never learnt
 courtyard, seeds 21 (distractors) and 37 (none), 3000 iterations: 30.2 dB and 33.3 dB without, 32.4 and 36.5
 with it; plain 3DGS 27.2 and 36.4, exact masks 32.6 and 36.4.
 
+A mask also takes for granted that the render shows what is behind the distractor. Where no other photo shows
+what the render shows, the surface was never learnt, often because every view masks it: there evidence counts
+less (`unconfirmed`).
+
 Other views' evidence is used only where their photos show the same colour as this one: with a crowd in front
 of the scene every view has evidence everywhere, and would discount distractors of the others.
 
@@ -29,6 +33,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ambiguous_wild.core import Camera
@@ -46,7 +51,7 @@ from ambiguous_wild.methods.refinesplat.maps import (
     common_offset,
     to_device,
 )
-from ambiguous_wild.methods.refinesplat.structure import blur_and_shrink, nearest
+from ambiguous_wild.methods.refinesplat.structure import blur_and_shrink, box_filter, nearest
 from ambiguous_wild.methods.refinesplat.view_lookup import COLOURS, combine, look_up
 from ambiguous_wild.splat.backend import backend_of
 from ambiguous_wild.splat.cpu.compile import torch_threads
@@ -54,6 +59,7 @@ from ambiguous_wild.splat.cpu.compile import torch_threads
 SPREAD = 9  # px, box over a view's evidence before others read it: depth is off by a few pixels
 _BLUR = 5  # px, box over photos before their colours are compared, for the same reason
 _SHRINK = 2  # maps are stored at half the photo's size
+_RENDER_AGREES = 0.08  # difference of colour in [0, 1] up to which a photo shows what the render shows
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,7 @@ class MultiViewConfig:
     # if fewer views see the surface, colours are not tested, and that of the sparse points is looked up too
     known_by: int = 3
     sparse: bool = True  # whether the sparse points' surface is looked up there
+    unconfirmed: float = 0.25  # factor of evidence where no other photo shows what the render shows; 1 = none
     # number of other views (at most those with stored evidence) that must see a surface, or its evidence does
     # not count; where fewer have the place in their frame at all, nothing is masked
     seen_by: int = 2
@@ -78,6 +85,7 @@ class MultiViewConfig:
         check_limits(
             self, "refinesplat.mask.multiview",
             views=(1, math.inf), quantile=(0, 1), agreeing=(1e-6, 1), known_by=(1, math.inf),
+            unconfirmed=(0, 1),
             **dict.fromkeys(("strength", "depth", "free", "agree", "seen_by"), (0, math.inf)),
         )  # fmt: skip
 
@@ -89,6 +97,7 @@ class MultiViewEvidence:
     evidence: Tensor  # at the quantile of the config; NaN where no other view sees the surface
     weight: Tensor  # in [0, 1]: how well their photos agree with this one
     coverage: Tensor  # in [0, 1]: share of `seen_by` views that see the surface
+    confirmed: Tensor  # 1 where a view's photo shows what the render shows at the surface, else 0
 
 
 @dataclass(frozen=True)
@@ -125,6 +134,7 @@ class _ViewEvidence:
     evidence: Tensor  # float32, NaN where a view sees another surface or none
     same: Tensor  # bool, where it sees the surface
     agree: Tensor  # bool, where it sees the surface in the same colour
+    shown: Tensor  # bool, where it sees the surface in the render's colour
 
 
 class MultiViewStore:
@@ -179,7 +189,8 @@ class MultiViewStore:
         ]
 
         if self.count:
-            self.query(0, torch.zeros(self.sizes[0], device=device))  # compiles the CPU's kernels
+            depth = torch.zeros(self.sizes[0], device=device)
+            self.query(0, depth, torch.zeros((*depth.shape, 3), device=device))  # compiles the CPU's kernels
 
     def store(self, view: int, evidence: Tensor, depth: Tensor) -> None:
         """Store the evidence of a view.
@@ -213,12 +224,13 @@ class MultiViewStore:
         """Resize an expected depth to half the photo's size, [h, w]."""
         return nearest(depth, self.sizes[view])
 
-    def query(self, view: int, depth: Tensor) -> MultiViewEvidence | None:
+    def query(self, view: int, depth: Tensor, image: Tensor) -> MultiViewEvidence | None:
         """Return other views' evidence about the surface at each pixel; None if there is no other view.
 
         Args:
             view: the querying view.
             depth: depth of its surface, [h, w], from `halved`.
+            image: its render, [H, W, 3] in [0, 1], any size.
         """
         if not self.count:
             return None
@@ -226,7 +238,7 @@ class MultiViewStore:
         # also in the first round: to wait until all neighbours have evidence gave 16.9 dB instead of 18.7
         least = min(config.seen_by, len(self.stored_views.intersection(self.near[view])))
         if backend_of(depth.device).kernels:
-            return MultiViewEvidence(*self._query_kernels(view, depth, least))
+            return MultiViewEvidence(*self._query_kernels(view, depth, image, least))
         points = _NeighbourRays(
             torch.addcmul(torch.addcmul(own.ahead, own.down, own.y), own.right, own.x).flatten(2),
             own.origin,
@@ -236,24 +248,24 @@ class MultiViewStore:
             self.surface.select(own.neighbours),
         )
         answers, difference = self._look_up(points, slice(None), depth.flatten())
-        offset = None
+        offset, wrong = None, points.colours - small_render(image, depth.shape).flatten(1)
         if difference is not None:
             some, same = (_every_second(t, shape) for t in (difference, answers.same))
             offset = common_offset(some, same, config.agree)
-            answers = replace(answers, agree=colours_agree(difference, answers.same, config.agree, offset))
+            answers = self._compared(answers, difference, offset, wrong)
         few = answers.same.sum(0) < config.known_by
         sparse_depth = self.sparse_depth[view]
         if sparse_depth is not None:
-            self._look_up_sparse(points, sparse_depth.flatten(), answers, few, offset)
+            self._look_up_sparse(points, sparse_depth.flatten(), answers, few, offset, wrong)
         seen = answers.same.sum(0)
         weight = agreement_weight(seen, answers.agree.sum(0), config.agreeing, few)
         evidence = self.ranks.quantile_of(answers.evidence, seen)
         coverage = (seen / least).clamp_(max=1.0) if least else torch.ones(seen.shape, device=seen.device)
-        maps = (evidence, weight.float(), coverage.float())
+        maps = (evidence, weight.float(), coverage.float(), answers.shown.any(0).float())
         return MultiViewEvidence(*(x.view(shape) for x in maps))
 
-    def _query_kernels(self, view: int, depth: Tensor, least: int) -> Tensor:
-        """Return evidence, weight and coverage [3, h, w] by the kernels of the CPU."""
+    def _query_kernels(self, view: int, depth: Tensor, image: Tensor, least: int) -> Tensor:
+        """Return evidence, weight, coverage and confirmed [4, h, w] by the kernels of the CPU."""
         own, config = self.queries[view], self.config
         n, (h, w) = self.count, depth.shape
         evidences, colours = self.evidence.stack.numpy(), self.colours.stack.numpy()
@@ -261,18 +273,21 @@ class MultiViewStore:
         shares, surface_shares = (s.shares_of_views() for s in (self.evidence, self.surface))
         rays = own.frames, own.x.numpy(), own.y.numpy().ravel()
         near, of = own.neighbours.numpy(), np.float32
-        apart = of(3.0 * config.agree * WHITE)
-        rules = of(config.depth), apart, of(FAR_MORE), of(config.agreeing), config.known_by
+        apart, shown = (
+            of(3.0 * most * WHITE * (config.agree > 0)) for most in (config.agree, _RENDER_AGREES)
+        )
+        rules = of(config.depth), apart, of(FAR_MORE), of(config.agreeing), config.known_by, shown
         evidence, same = np.empty((n, h, w), np.float32), np.empty((n, h, w), np.bool_)
         difference, offset = np.empty((n, h, w, 3), np.float32), np.zeros((n, 3), np.float32)
-        counts, out = np.zeros((n, 3, COLOURS), np.int64), np.empty((3, h, w), np.float32)
+        counts, out = np.zeros((n, 3, COLOURS), np.int64), np.empty((4, h, w), np.float32)
         buffers = evidence, same, difference, offset
         look_up(*rays, depth.numpy(), near, view, evidences, colours, depths, shares, rules, counts, *buffers)
         sparse_depth = self.sparse_depth[view]
         sparse = np.empty((0, 0), np.float32) if sparse_depth is None else sparse_depth.numpy()
         combine(
-            *rays, sparse, near, view, evidences, colours, depths, surfaces, shares, surface_shares,
-            rules, least, self.ranks.pair.numpy(), self.ranks.share.numpy(), *buffers, out,
+            *rays, sparse, near, view, evidences, colours, small_render(image, (h, w)).numpy(), depths,
+            surfaces, shares, surface_shares, rules, least, self.ranks.pair.numpy(),
+            self.ranks.share.numpy(), *buffers, out,
         )  # fmt: skip
         return torch.from_numpy(out)
 
@@ -283,6 +298,7 @@ class MultiViewStore:
         answers: _ViewEvidence,
         few: Tensor,
         offset: Tensor | None,
+        wrong: Tensor,
     ) -> None:
         """Use evidence about the sparse points' surface where more views see it than the render's.
 
@@ -295,14 +311,15 @@ class MultiViewStore:
                 look past a distractor at the background.
             offset: offset of colours from the first answers; from these pixels alone, a car could look like
                 exposure.
+            wrong: [3, P], differences of colours between the view's photo and its render.
         """
         rows = backend_of(few.device).visible_rows(lambda: few & depth.isfinite())
         other, difference = self._look_up(points, rows, depth[rows], sparse=True)
         if difference is not None and offset is not None:
-            other = replace(other, agree=colours_agree(difference, other.same, self.config.agree, offset))
+            other = self._compared(other, difference, offset, wrong[:, rows])
         more = few[rows] & (other.same.sum(0) > answers.same[:, rows].sum(0))
-        pairs = ((answers.evidence, other.evidence), (answers.same, other.same), (answers.agree, other.agree))
-        for old, new in pairs:
+        for name in ("evidence", "same", "agree", "shown"):
+            old, new = getattr(answers, name), getattr(other, name)
             old[:, rows] = torch.where(more, new, old[:, rows])
         few[rows] &= ~more
 
@@ -330,8 +347,16 @@ class MultiViewStore:
         theirs = points.stored.linear(places)[:, :, 0]
         evidence = torch.where(same, theirs[:, 0], torch.nan)
         if self.config.agree <= 0:
-            return _ViewEvidence(evidence, same, same.clone()), None
-        return _ViewEvidence(evidence, same, same), points.colours[:, rows] - theirs[:, 1:].round_()
+            return _ViewEvidence(evidence, same, same.clone(), same.clone()), None
+        return _ViewEvidence(evidence, same, same, same), points.colours[:, rows] - theirs[:, 1:].round_()
+
+    def _compared(
+        self, answers: _ViewEvidence, difference: Tensor, offset: Tensor, wrong: Tensor
+    ) -> _ViewEvidence:
+        """Compare colours: of the photos by `difference`, of the render by `difference` - `wrong`."""
+        agree = colours_agree(difference, answers.same, self.config.agree, offset)
+        shown = colours_agree(difference - wrong, answers.same, _RENDER_AGREES, offset)
+        return replace(answers, agree=agree, shown=shown)
 
     def _near(self, surface_z: Tensor, z: Tensor) -> Tensor:
         """Return which points of depth z lie on a view's surface of depth `surface_z`; 0 = no surface."""
@@ -352,21 +377,22 @@ def _every_second(x: Tensor, shape: torch.Size) -> Tensor:
 def discount(
     evidence: Tensor, others: MultiViewEvidence | None, unit: Tensor, config: MultiViewConfig
 ) -> Tensor:
-    """Return evidence [H, W] * coverage / sqrt(1 + strength * excess).
+    """Return evidence [H, W] * coverage * confirmed / sqrt(1 + strength * excess).
 
-    The excess is weight * (other views' evidence above `free`).
+    The excess is weight * (other views' evidence above `free`); 0 of confirmed counts as `unconfirmed`.
 
     Args:
         evidence: [H, W] >= 0.
         others: result of `MultiViewStore.query`, any size; NaN evidence discounts nothing.
         unit: normal evidence in the scene, 0-d, above 0.
-        config: strength and `free`.
+        config: strength, `free` and `unconfirmed`.
     """
     if others is None:
         return evidence
     excess = (others.evidence / unit - config.free).clamp_(min=0.0) * others.weight
     at_pixels = resized(excess.nan_to_num_(nan=0.0), *evidence.shape)
-    return evidence * resized(others.coverage, *evidence.shape) / (1.0 + config.strength * at_pixels).sqrt_()
+    known = others.coverage * (config.unconfirmed + (1.0 - config.unconfirmed) * others.confirmed)
+    return evidence * resized(known, *evidence.shape) / (1.0 + config.strength * at_pixels).sqrt_()
 
 
 def _query(
@@ -425,6 +451,12 @@ def small_colours(photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     blurred = cv2.blur(np.ascontiguousarray(photo), (_BLUR, _BLUR), borderType=cv2.BORDER_REPLICATE)
     small = cv2.resize(blurred, size, interpolation=cv2.INTER_AREA)
     return np.clip(np.rint(small * 255.0), 0, 255).astype(np.uint8)
+
+
+def small_render(image: Tensor, size: Sequence[int]) -> Tensor:
+    """Shrink a render [H, W, 3] in [0, 1] as `small_colours` does, [3, h, w] from 0 to 255."""
+    blurred = box_filter(image.permute(2, 0, 1).contiguous(), _BLUR)
+    return F.adaptive_avg_pool2d(blurred, tuple(size)).mul_(WHITE)
 
 
 def nearest_views(cameras: Sequence[Camera], count: int) -> list[list[int]]:

@@ -202,7 +202,7 @@ class PixelEvidence:
         if config.multiview.strength > 0:
             mean_depth = depth / alpha.clamp(min=1e-3) * (alpha > 1e-3)
             halved = self.other_views.halved(view, mean_depth)
-            others = self.other_views.query(view, halved)
+            others = self.other_views.query(view, halved, resized(image, *size))
             if store:
                 self.other_views.store(view, evidence, halved)
         if store:

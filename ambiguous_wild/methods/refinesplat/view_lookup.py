@@ -103,7 +103,8 @@ def look_up(
         shares: [views, 2] share of the stack's width and height that each map covers.
         rules: relative difference of depth up to which two views see the same surface; sum of three
             differences of colour below which photos agree, 0 = not tested; ratio of agreeing pixels from
-            which an offset of colours is accepted; `agreeing` and `known_by` of `MultiViewConfig`.
+            which an offset of colours is accepted; `agreeing` and `known_by` of `MultiViewConfig`; sum of
+            three differences below which a photo shows what the render shows.
         counts: [n, 3, 511] zeros.
         evidence, same, difference, offset: outputs [n, h, w], [n, h, w] bool, [n, h, w, 3], [n, 3].
     """
@@ -142,36 +143,41 @@ def look_up(
 
 @parallel_kernel
 def combine(
-    frames, x, y, sparse, near, view, evidences, colours, depths, surfaces, shares, surface_shares,
+    frames, x, y, sparse, near, view, evidences, colours, render, depths, surfaces, shares, surface_shares,
     rules, least, pair, share, evidence, same, difference, offset, out,
 ):  # fmt: skip
     """Combine the neighbours' evidence at each pixel; that about the sparse points' surface if more see it.
 
     Args:
         sparse: [h, w] depth of the sparse points' surface, NaN = none; or [0, 0].
+        render: [3, h, w] colours of the view's render, as `colours`.
         surfaces: [views, 1, H', W'] depth of the sparse points in every view, 0 = none.
         surface_shares: [views, 2], see `shares`.
         least: number of views that must see a surface; 0 = any.
         pair: [2, n + 1] ranks of the quantile for each number of values.
         share: [n + 1] weight of the second.
-        out: [3, h, w]: evidence (NaN = nobody sees the surface), weight, coverage; see `MultiViewEvidence`.
+        out: [4, h, w]: evidence (NaN = nobody sees the surface), weight, coverage, confirmed; see
+            `MultiViewEvidence`.
 
     The others are those of `look_up`, whose outputs are read.
     """
     n, height, width = evidence.shape
     for row in numba.prange(height):
-        read, away = np.empty(4, np.float32), np.empty(3, np.float32)
+        read, away, wrong = np.empty(4, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
         values, sparse_values = np.empty(n, np.float32), np.empty(n, np.float32)
         for column in range(width):
-            seen, agreed = 0, 0
+            seen, agreed, shown = 0, 0, 0
+            for c in range(3):  # of the photo from the render
+                wrong[c] = colours[view, c, row, column] - render[c, row, column]
             for k in range(n):
                 if same[k, row, column]:
                     values[seen] = evidence[k, row, column]
                     seen += 1
                     agreed += _agrees(difference[k, row, column], offset[k], rules[1])
+                    shown += _agrees(difference[k, row, column], offset[k] + wrong, rules[5])
             few = seen < rules[4]
             if few and sparse.shape[0] > 0 and np.isfinite(sparse[row, column]):
-                others, others_agreed = 0, 0
+                others, others_agreed, others_shown = 0, 0, 0
                 for k in range(n):
                     u, v, z = _place(frames[k], x[column], y[row], sparse[row, column])
                     if _is_near(depths, near[k], shares, (u, v), z, rules[0]) or _is_near(
@@ -183,8 +189,9 @@ def combine(
                         sparse_values[others] = read[0]
                         others += 1
                         others_agreed += _agrees(away, offset[k], rules[1])
+                        others_shown += _agrees(away, offset[k] + wrong, rules[5])
                 if others > seen:
-                    seen, agreed, few = others, others_agreed, False
+                    seen, agreed, shown, few = others, others_agreed, others_shown, False
                     values[:seen] = sparse_values[:seen]
             for k in range(1, seen):  # sorted, at most n values
                 value, at = values[k], k
@@ -200,3 +207,4 @@ def combine(
             part = np.float32(agreed) / np.float32(max(seen, 1)) / rules[3]
             out[1, row, column] = _ONE if few else min(part, _ONE)
             out[2, row, column] = min(np.float32(seen) / np.float32(least), _ONE) if least > 0 else _ONE
+            out[3, row, column] = _ONE if shown > 0 else _ZERO

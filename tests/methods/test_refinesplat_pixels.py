@@ -319,8 +319,9 @@ def test_hard_surfaces_are_forgiven_and_what_one_view_shows_is_not():
 def test_a_surface_that_too_few_others_see_is_no_evidence():
     """A render with a wrong depth, and no sparse points: no other photo could teach what is masked."""
     cameras, (render, *others) = [camera(0.05 * i) for i in range(4)], plain(4)
-    photos = [np.full((H, W, 3), 0.9, np.float32), *others]  # the first shows a distractor
-    for least, wrong in ((2, 0.0), (0, 1.0)):
+    photos = [render.copy(), *others]
+    photos[0][H // 4 : 3 * H // 4, W // 4 : 3 * W // 4] = 0.9  # a distractor
+    for least, wrong in ((2, 0.0), (0, MultiViewConfig().unconfirmed)):
         pixels = pixel_evidence(photos, cameras, multiview=MultiViewConfig(seen_by=least))
         for view in range(4):
             looked(pixels, view, render, store=True)

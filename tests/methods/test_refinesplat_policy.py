@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from ambiguous_wild.core import Camera, Scene, SparsePoints, View
+from ambiguous_wild.methods.refinesplat import masks as mask_module
 from ambiguous_wild.methods.refinesplat.hyperparameters import MaskConfig, RefineSplatConfig
 from ambiguous_wild.methods.refinesplat.identity import PsiConfig
 from ambiguous_wild.methods.refinesplat.pixels import GAPS
@@ -132,11 +133,11 @@ def fresh(scene, config: RefineSplatConfig = FAST) -> RefineSplatMask:
 
 
 @BOTH
-def test_distractors_are_masked_and_the_rest_is_kept(scene, config):
-    policy = fresh(scene, config)
+def test_distractors_are_masked_and_the_rest_is_kept(scene, walled, config):
+    policy = fresh(walled, config)
     for rounds in range(2):
         for view in range(VIEWS):
-            keep = policy.keep(step_of(scene.data, view, blurred(scene.clean[view], view), 100 + rounds))
+            keep = policy.keep(step_of(walled.data, view, blurred(scene.clean[view], view), 100 + rounds))
             assert keep.dtype == torch.float32
             assert set(np.unique(keep)) <= {0.0, 1.0}
             found = keep.numpy() < 0.5
@@ -192,7 +193,8 @@ def sparse_wall(scene) -> TrainData:
     return dataclasses.replace(data, cameras=cameras, scene=dataclasses.replace(data.scene, points=points))
 
 
-def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene):
+def test_the_first_look_the_ceiling_and_the_sparse_points_reach_the_masks(scene, monkeypatch):
+    monkeypatch.setattr(mask_module, "WHOLE", 2.0)  # the rest of a masked instance is kept
     data = sparse_wall(scene)
     look = dataclasses.replace(FAST.first_look, least=0.0, threshold=0.1, normal=1.0, known_by=1)
 
@@ -396,7 +398,8 @@ def test_a_mask_is_limited_by_the_photos_first_look(walled):
     assert shares[1] <= GAPS * policy.priors[1].most < shares[0], shares
 
 
-def test_in_a_crowd_nothing_is_masked_that_the_first_look_keeps(walled):
+def test_in_a_crowd_only_the_rest_of_instances_is_masked_that_the_first_look_keeps(walled, monkeypatch):
+    monkeypatch.setattr(mask_module, "WHOLE", 2.0)
     mask, outside = dataclasses.replace(FAST.mask, ceiling_least=0.0), []
     for crowd in (0.0, 1.0):  # the share from which there is one
         look = dataclasses.replace(FAST.first_look, crowd=crowd, least=0.0, most=0.0)

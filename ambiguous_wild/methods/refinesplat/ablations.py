@@ -127,6 +127,11 @@ ABLATIONS = (
             Variant("no-ceiling", ("mask.ceiling=0",), "no upper limit of thresholds"),
             Variant("low-ceiling", ("mask.ceiling_least=0",), "no lower limit of the ceiling"),
             Variant("no-sparse-points", ("mask.multiview.sparse=false",), "unlearnt surfaces have no depth"),
+            Variant(
+                "unconfirmed",
+                ("mask.multiview.unconfirmed=1",),
+                "full evidence where no other photo shows what the render shows",
+            ),
             Variant("rims", ("mask.multiview.seen_by=0",), "masks where no other photo looks"),
             Variant("no-first-look", ("first_look.on=false",), "no masks before the first renders"),
             Variant("first-look-once", ("first_look.rounds=0",), "not asked again"),

@@ -104,9 +104,12 @@ def reasons(store: MaskStore, view: int, maps: ComparisonMaps, masks: PhotoMasks
     maskable = store.maskable[view]
     if maskable is not None:
         found = "other parts of this photo were found to move before training, and only those are masked"
-        add(~maskable, f"kept: {found}")
+        add(~maskable & ~masked, f"kept: {found}")
     if structure and seen is not None:
-        add(~seen, "kept: too few other photos see this surface")
+        add(~seen & ~masked, "kept: too few other photos see this surface")
+    for judged_ in (maskable, seen if structure else None):
+        if judged_ is not None:
+            add(~judged_ & masked, "masked: most of its instance is")
     moving = store.moving[view]
     if moving is not None:
         add(masked & moving, "masked: it moves between neighbouring photos")

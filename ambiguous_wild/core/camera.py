@@ -73,7 +73,8 @@ class Camera:
     def center(self) -> np.ndarray:
         """Camera centre in the world, [3] float64."""
         rotation, translation = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
-        return -rotation.T @ translation
+        # not by BLAS, whose last digits depend on the processor: simulated pixels would
+        return -(rotation * translation[:, None]).sum(0)
 
     @property
     def intrinsics(self) -> np.ndarray:

@@ -83,14 +83,15 @@ def focal_px(spec: CaptureSpec) -> float:
 
 def look_at(eye: np.ndarray, target: np.ndarray, roll_deg: float) -> np.ndarray:
     """Return cam_from_world [4, 4] of a camera at `eye` that looks at `target`; z is up in the world."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
+    # no BLAS: its last digits depend on the processor, and with them pixels of the capture
+    forward = (target - eye) / np.linalg.norm(target - eye, axis=-1)
     right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
+    right /= np.linalg.norm(right, axis=-1)
     down = np.cross(forward, right)
     c, s = np.cos(np.deg2rad(roll_deg)), np.sin(np.deg2rad(roll_deg))
     rotation = np.stack([c * right + s * down, c * down - s * right, forward])
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    pose[:3, :3], pose[:3, 3] = rotation, -(rotation * eye).sum(-1)
     return pose
 
 

@@ -195,8 +195,9 @@ def _random_placement(
 ) -> DistractorPose:
     """Draw a random point on the ground within the picture, at the distractor's distance."""
     column = rng.uniform(0.06, 0.94) * camera.width
-    direction = camera.cam_from_world[:3, :3].T @ np.array([(column - camera.cx) / camera.fx, 0.0, 1.0])
-    flat = direction[:2] / np.linalg.norm(direction[:2])
+    ray = np.array([(column - camera.cx) / camera.fx, 0.0, 1.0])
+    direction = (camera.cam_from_world[:3, :3].T * ray).sum(-1)
+    flat = direction[:2] / np.linalg.norm(direction[:2], axis=-1)
     x, y = camera.center[:2] + rng.uniform(*distractor.distance_m) * flat
     return DistractorPose(which, float(x), float(y), float(rng.uniform(-180, 180)), float(rng.random()))
 

@@ -92,7 +92,7 @@ def draw_white_balance(settings: WhiteBalance, random: PhotoRandom) -> tuple[flo
     warmth = settings.warmth * random.drift("white_balance", cycles=2.3)
     tint = settings.tint * random.drift("white_balance tint", cycles=1.1)
     gains = 2.0 ** np.array([warmth / 2, tint, -warmth / 2])
-    r, g, b = (float(v) for v in gains / (gains @ _LUMINANCE))
+    r, g, b = (float(v) for v in gains / (gains * _LUMINANCE).sum())
     return r, g, b
 
 
@@ -202,7 +202,7 @@ def time_of_day(light: Light, hour: float, strength: float, sweep_deg: float) ->
     about_z = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     lit = replace(
         light,
-        sun=np.ascontiguousarray(light.sun @ about_z.T),
+        sun=(light.sun[:, None] * about_z).sum(-1),
         sun_colour=light.sun_colour * sun,
         sky_colour=light.sky_colour * sky,
         ground_colour=light.ground_colour * ground,
@@ -277,7 +277,7 @@ def camera_angular_velocity(random: PhotoRandom, speed_deg_s: float) -> np.ndarr
     """
     rng = random.rng("hand")
     direction = rng.normal(size=3) * (1.0, 1.0, 0.35)
-    return np.deg2rad(speed_deg_s) * rng.uniform(0.3, 1.0) * direction / np.linalg.norm(direction)
+    return np.deg2rad(speed_deg_s) * rng.uniform(0.3, 1.0) * direction / np.linalg.norm(direction, axis=-1)
 
 
 def camera_rotations(
@@ -311,7 +311,7 @@ def rotated_points(points: np.ndarray, turns: np.ndarray) -> np.ndarray:
         [H, W, 2] normalised.
     """
     rays = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=-1)
-    rays = rays @ Rotation.from_rotvec(turns).as_matrix().transpose(0, 2, 1)
+    rays = (rays[:, :, None] * Rotation.from_rotvec(turns).as_matrix()[:, None]).sum(-1)
     if not (rays[..., 2] > 0).all():
         raise AwError(
             "the hand's motion turns the edge of the photo behind the camera: raise focal_35mm, or lower "

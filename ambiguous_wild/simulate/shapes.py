@@ -62,7 +62,7 @@ def _ball(p: np.ndarray, at: Vector, half: Vector | float) -> np.ndarray:
 def _rod(p: np.ndarray, start: Vector, end: Vector, radius: float) -> np.ndarray:
     """Distance to a capsule."""
     a, b = np.asarray(start), np.asarray(end)
-    along = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+    along = np.clip(((p - a) * (b - a)).sum(-1) / ((b - a) ** 2).sum(), 0.0, 1.0)
     return np.linalg.norm(p - a - along[..., None] * (b - a), axis=-1) - radius
 
 

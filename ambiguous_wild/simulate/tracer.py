@@ -117,9 +117,9 @@ def shadow_grid(table: ShapeTable, sun: np.ndarray) -> tuple[np.ndarray, np.ndar
     listed = []
     for k, direction in enumerate(sun):
         first = np.cross(direction, (1.0, 0.0, 0.0) if abs(direction[0]) < 0.9 else (0.0, 1.0, 0.0))
-        first /= np.linalg.norm(first)
+        first /= np.linalg.norm(first, axis=-1)
         axes = np.stack([first, np.cross(direction, first)])
-        middle = table.center[which] @ axes.T
+        middle = (table.center[which][:, None] * axes).sum(-1)
         low = (middle - radius[:, None]).min(0)
         scale = (CELLS - 1e-6) / max(float(((middle + radius[:, None]).max(0) - low).max()), 1e-9)
         frame[k] = [*axes.ravel(), *low, scale]

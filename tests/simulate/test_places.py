@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -114,3 +117,24 @@ def test_a_place_is_named_in_the_file_and_has_limits_of_its_own():
 
 def test_every_texture_that_a_spec_may_name_is_painted():
     assert set(SHEETS) == set(TEXTURES)
+
+
+def test_cameras_and_rays_do_not_depend_on_the_processor():
+    """BLAS would: its last digits follow from the kernels that it chooses for the processor."""
+    code = (
+        "import numpy as np\n"
+        "from ambiguous_wild.core import Camera\n"
+        "from ambiguous_wild.simulate.capture_writer import look_at\n"
+        "rng = np.random.default_rng(0)\n"
+        "poses = [look_at(*rng.normal(size=(2, 3)), rng.normal()) for _ in range(200)]\n"
+        "centres = [Camera(8, 8, 9.0, 9.0, 4.0, 4.0, pose).center for pose in poses]\n"
+        "print(np.concatenate([np.ravel(poses), np.ravel(centres)]).tobytes().hex())"
+    )
+    said = {
+        subprocess.run(
+            [sys.executable, "-c", code], env=os.environ | {"OPENBLAS_CORETYPE": kernels},
+            capture_output=True, check=True, text=True,
+        ).stdout
+        for kernels in ("Nehalem", "Haswell")
+    }  # fmt: skip
+    assert len(said) == 1 and len(said.pop()) > 200 * 19 * 16 - 1

@@ -161,7 +161,9 @@ def write_drawn(names: Sequence[str], args: argparse.Namespace) -> None:
     words = [word for metric in DRAWN_METRICS for word in ("--metric", metric)]
     table = aw("table", *(str(args.runs / name) for name in names), *words, "--format", "markdown")
     lines = [line for line in table.splitlines() if not line.startswith("- command: ")]
-    write_section(DRAWN_RESULTS, " ".join([f"{args.iterations} iterations", *args.set]), "\n".join(lines))
+    size = ["twice the side"] if args.large else []
+    title = " ".join([f"{args.iterations} iterations", *size, *args.set])
+    write_section(DRAWN_RESULTS, title, "\n".join(lines))
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -186,7 +188,7 @@ def main(words: Sequence[str] | None = None) -> int:
         suite, args.work = LARGE, args.work / "large"
     args.runs = args.work / "-".join(["runs", *length, *args.set])
     real = {capture.name: capture for capture in real_captures(args.data, args.large)} if args.data else {}
-    known = [*SUITE.scenes, *real]
+    known = [*suite.scenes, *real]
     if unknown := set(args.only or ()) - {*known}:
         raise AwError(f"--only {min(unknown)}: no such capture; there are {', '.join(known)}")
     # 3dgs+truth, a default, asks for masks of all train photos

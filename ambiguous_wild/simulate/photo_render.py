@@ -248,7 +248,7 @@ def _sources(
     if effects.motion_blur is not None:
         blur = effects.motion_blur
         velocity = fx.camera_angular_velocity(random, blur.speed_deg_s)
-        length = float(np.linalg.norm(velocity)) * blur.exposure_s * camera.fx
+        length = float(np.linalg.norm(velocity, axis=-1)) * blur.exposure_s * camera.fx
         count = min(max(2, math.ceil(length * fine)), _MAX_INSTANTS)
         instants = fx.camera_rotations(velocity, blur.exposure_s, count)
         drawn["motion_blur"] = {"exposure_s": blur.exposure_s, "length_px": length}

@@ -197,15 +197,22 @@ def test_a_render_is_confirmed_where_another_photo_shows_it():
 
 
 def test_a_masked_instance_is_masked_where_no_other_photo_looks():
-    labels = np.zeros((H, W), np.int32)
-    labels[10:, 5:20], labels[10:, 40:55] = 1, 2
-    values = np.zeros((H, W), np.float32)
-    values[10:30, 5:20] = values[24:30, 40:55] = 100.0  # all of one and a third of the other's upper part
-    unseen = np.zeros((H, W), bool)
-    unseen[30:] = True
-    found = masks_of(values, labels, MaskConfig(use_local=False), ceiling=20.0, unseen=unseen)
-    masked = found.keep.numpy() < 0.5
-    assert masked[10:, 5:20].all() and not masked[30:, 20:].any() and masked[26, 45]
+    """Not one that is masked for a third, of which little may be masked, or that is static."""
+    labels, static = np.zeros((H, W), np.int32), np.array([False, False, False, True])
+    for instance, column in enumerate((2, 18, 34, 50), 1):
+        labels[10:, column : column + 10] = instance
+    maskable = np.zeros((H, W), bool)
+    maskable[:30] = True
+    maskable[:28, 34:44] = False
+    masked = np.zeros((H, W), bool)
+    masked[10:25, 2:12] = masked[24:30, 18:28] = masked[28:30, 34:44] = masked[10:30, 50:60] = True
+    known = InstanceLabels([labels], [static], [maskable], "cpu")
+    found = known.beyond(0, tensor(masked), tensor(maskable)).numpy()
+    assert found[30:, 2:12].all() and found.sum() == 10 * 10
+    # and in a mask of evidence
+    values = 100.0 * masked.astype(np.float32)
+    keep = masks_of(values, labels, MaskConfig(use_local=False), ceiling=20.0, unseen=~maskable).keep.numpy()
+    assert (keep[30:, 2:12] == 0).all() and (keep[30:, 18:28] == 1).all()
 
 
 def test_views_that_show_another_colour_have_no_word():
@@ -321,7 +328,7 @@ def test_a_surface_that_too_few_others_see_is_no_evidence():
     cameras, (render, *others) = [camera(0.05 * i) for i in range(4)], plain(4)
     photos = [render.copy(), *others]
     photos[0][H // 4 : 3 * H // 4, W // 4 : 3 * W // 4] = 0.9  # a distractor
-    for least, wrong in ((2, 0.0), (0, MultiViewConfig().unconfirmed)):
+    for least, wrong in ((2, 0.0), (0, 1.0)):
         pixels = pixel_evidence(photos, cameras, multiview=MultiViewConfig(seen_by=least))
         for view in range(4):
             looked(pixels, view, render, store=True)

@@ -398,7 +398,7 @@ def test_a_mask_is_limited_by_the_photos_first_look(walled):
     assert shares[1] <= GAPS * policy.priors[1].most < shares[0], shares
 
 
-def test_in_a_crowd_only_the_rest_of_instances_is_masked_that_the_first_look_keeps(walled, monkeypatch):
+def test_in_a_crowd_nothing_is_masked_that_the_first_look_keeps(walled, monkeypatch):
     monkeypatch.setattr(mask_module, "WHOLE", 2.0)
     mask, outside = dataclasses.replace(FAST.mask, ceiling_least=0.0), []
     for crowd in (0.0, 1.0):  # the share from which there is one

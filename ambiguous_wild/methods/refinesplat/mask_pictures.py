@@ -107,9 +107,9 @@ def reasons(store: MaskStore, view: int, maps: ComparisonMaps, masks: PhotoMasks
         add(~maskable & ~masked, f"kept: {found}")
     if structure and seen is not None:
         add(~seen & ~masked, "kept: too few other photos see this surface")
-    for judged_ in (maskable, seen if structure else None):
-        if judged_ is not None:
-            add(~judged_ & masked, "masked: most of its instance is")
+    for allowed in (maskable, seen if structure else None):
+        if allowed is not None:
+            add(~allowed & masked, "masked: most of its instance is")
     moving = store.moving[view]
     if moving is not None:
         add(masked & moving, "masked: it moves between neighbouring photos")

@@ -39,7 +39,8 @@ from ambiguous_wild.splat.backend import backend_of
 if TYPE_CHECKING:
     from ambiguous_wild.splat.step import Step, TrainData
 
-WHOLE = 0.6  # share of an instance's maskable pixels from which its other pixels are masked too
+# shares of an instance, masked of its maskable pixels and maskable of all, from which the rest is masked
+WHOLE, JUDGED = 0.6, 0.3
 PRICE = 3.0  # cost of a masked pixel, in MADs above the median distance, if `disagree` is off
 
 
@@ -114,7 +115,7 @@ class InstanceLabels:
         clean = [w if s is None else np.where(s, w, 0) for w, s in zip(whole, seen, strict=True)]
         self._of_pixel = [torch.from_numpy(label.ravel()).to(device) for label in clean]
         # also of pixels that may not be judged
-        self._whole = [
+        self._all = [
             judged if w is c else torch.from_numpy(w.ravel()).to(device)
             for judged, w, c in zip(self._of_pixel, whole, clean)
         ]
@@ -149,21 +150,24 @@ class InstanceLabels:
         return F.pad(values, (1, 0)).index_select(0, self.of_pixel(view)).view(shape)
 
     def beyond(self, view: int, masked: Tensor, maskable: Tensor) -> Tensor:
-        """Return the pixels outside of `maskable` of instances that are masked almost whole, [H, W] bool.
+        """Return the pixels outside of `maskable` of instances that are mostly masked, [H, W] bool.
 
-        A distractor does not end where the other photos' frames do: its rest would be learnt.
+        A distractor does not end where the other photos' frames do: its rest would be learnt. Static
+        instances and those of which little is maskable stay.
 
         Args:
             view: index of the photo.
             masked: [H, W] bool.
             maskable: pixels that may be masked, [H, W] bool.
         """
-        labels, backend = self._whole[view].int(), backend_of(masked.device)
-        hit, all_ = (
+        labels, backend = self._all[view].int(), backend_of(masked.device)
+        hit, judged = (
             backend.label_sums(labels, self.most + 1, m.double().flatten()) for m in (masked, maskable)
         )
-        taken = (hit > 0) & (hit >= WHOLE * all_)
+        pixels = backend.label_sums(labels, self.most + 1)
+        taken = (hit > 0) & (hit >= WHOLE * judged) & (judged >= JUDGED * pixels)
         taken[:1] = False
+        taken[1:] &= ~self.static_flags[view]
         return taken.index_select(0, labels).view(masked.shape) & ~maskable
 
 
@@ -194,7 +198,7 @@ def make_masks(
         w2: weight of T_ent's lower subset.
         config: thresholds.
         ceiling: upper limit of the threshold, 0-d; None: no limit.
-        maskable: pixels that may be masked, [H, W] bool; None: all.
+        maskable: pixels that may be masked, with the rest of their instances, [H, W] bool; None: all.
         moving: pixels that move for certain, [H, W] bool; None: none do.
     """
     height, width = shape = labels.shapes[view]

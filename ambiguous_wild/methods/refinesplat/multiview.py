@@ -97,7 +97,8 @@ class MultiViewEvidence:
     evidence: Tensor  # at the quantile of the config; NaN where no other view sees the surface
     weight: Tensor  # in [0, 1]: how well their photos agree with this one
     coverage: Tensor  # in [0, 1]: share of `seen_by` views that see the surface
-    confirmed: Tensor  # 1 where a view's photo shows what the render shows at the surface, else 0
+    # 1 where a view's photo shows what the render shows at the surface, and if none need see it; else 0
+    confirmed: Tensor
 
 
 @dataclass(frozen=True)
@@ -230,7 +231,7 @@ class MultiViewStore:
         Args:
             view: the querying view.
             depth: depth of its surface, [h, w], from `halved`.
-            image: its render, [H, W, 3] in [0, 1], any size.
+            image: its render, [H, W, 3] in [0, 1] at the photo's size.
         """
         if not self.count:
             return None
@@ -261,7 +262,8 @@ class MultiViewStore:
         weight = agreement_weight(seen, answers.agree.sum(0), config.agreeing, few)
         evidence = self.ranks.quantile_of(answers.evidence, seen)
         coverage = (seen / least).clamp_(max=1.0) if least else torch.ones(seen.shape, device=seen.device)
-        maps = (evidence, weight.float(), coverage.float(), answers.shown.any(0).float())
+        confirmed = answers.shown.any(0) if least else torch.ones_like(few)
+        maps = (evidence, weight.float(), coverage.float(), confirmed.float())
         return MultiViewEvidence(*(x.view(shape) for x in maps))
 
     def _query_kernels(self, view: int, depth: Tensor, image: Tensor, least: int) -> Tensor:
@@ -454,7 +456,7 @@ def small_colours(photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def small_render(image: Tensor, size: Sequence[int]) -> Tensor:
-    """Shrink a render [H, W, 3] in [0, 1] as `small_colours` does, [3, h, w] from 0 to 255."""
+    """Blur and shrink a render [H, W, 3] in [0, 1] like `small_colours`, [3, h, w] from 0 to 255."""
     blurred = box_filter(image.permute(2, 0, 1).contiguous(), _BLUR)
     return F.adaptive_avg_pool2d(blurred, tuple(size)).mul_(WHITE)
 

@@ -164,6 +164,7 @@ def combine(
     n, height, width = evidence.shape
     for row in numba.prange(height):
         read, away, wrong = np.empty(4, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
+        expected = np.empty(3, np.float32)  # difference of a photo that shows what the render shows
         values, sparse_values = np.empty(n, np.float32), np.empty(n, np.float32)
         for column in range(width):
             seen, agreed, shown = 0, 0, 0
@@ -174,7 +175,9 @@ def combine(
                     values[seen] = evidence[k, row, column]
                     seen += 1
                     agreed += _agrees(difference[k, row, column], offset[k], rules[1])
-                    shown += _agrees(difference[k, row, column], offset[k] + wrong, rules[5])
+                    for c in range(3):
+                        expected[c] = offset[k, c] + wrong[c]
+                    shown += _agrees(difference[k, row, column], expected, rules[5])
             few = seen < rules[4]
             if few and sparse.shape[0] > 0 and np.isfinite(sparse[row, column]):
                 others, others_agreed, others_shown = 0, 0, 0
@@ -189,7 +192,9 @@ def combine(
                         sparse_values[others] = read[0]
                         others += 1
                         others_agreed += _agrees(away, offset[k], rules[1])
-                        others_shown += _agrees(away, offset[k] + wrong, rules[5])
+                        for c in range(3):
+                            expected[c] = offset[k, c] + wrong[c]
+                        others_shown += _agrees(away, expected, rules[5])
                 if others > seen:
                     seen, agreed, shown, few = others, others_agreed, others_shown, False
                     values[:seen] = sparse_values[:seen]
@@ -207,4 +212,4 @@ def combine(
             part = np.float32(agreed) / np.float32(max(seen, 1)) / rules[3]
             out[1, row, column] = _ONE if few else min(part, _ONE)
             out[2, row, column] = min(np.float32(seen) / np.float32(least), _ONE) if least > 0 else _ONE
-            out[3, row, column] = _ONE if shown > 0 else _ZERO
+            out[3, row, column] = _ONE if shown > 0 or least == 0 else _ZERO

@@ -78,7 +78,7 @@ class MultiViewConfig:
     sparse: bool = True  # whether the sparse points' surface is looked up there
     unconfirmed: float = 0.25  # factor of evidence where no other photo shows what the render shows; 1 = none
     # number of other views (at most those with stored evidence) that must see a surface, or its evidence does
-    # not count; where fewer have the place in their frame at all, nothing is masked
+    # not count; where fewer have the place in their frame at all, only the rest of masked instances is masked
     seen_by: int = 2
 
     def __post_init__(self) -> None:

@@ -193,7 +193,8 @@ class PixelEvidence:
         size = photo.shape[:2]
         judged, seen = resized(alpha, *size) >= config.least_alpha, self.seen[view]
         left_out = ~(judged if seen is None else judged & seen)
-        evidence = structure_residual(photo, resized(image, *size), config.base)
+        image = resized(image, *size)
+        evidence = structure_residual(photo, image, config.base)
         evidence = evidence.masked_fill_(left_out, 0.0)
         if config.memory > 0 and view in self.before:
             evidence = torch.lerp(evidence, self.before[view].float(), config.memory)
@@ -202,7 +203,7 @@ class PixelEvidence:
         if config.multiview.strength > 0:
             mean_depth = depth / alpha.clamp(min=1e-3) * (alpha > 1e-3)
             halved = self.other_views.halved(view, mean_depth)
-            others = self.other_views.query(view, halved, resized(image, *size))
+            others = self.other_views.query(view, halved, image)
             if store:
                 self.other_views.store(view, evidence, halved)
         if store:

@@ -458,7 +458,7 @@ def small_colours(photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def small_render(image: Tensor, size: Sequence[int]) -> Tensor:
     """Blur and shrink a render [H, W, 3] in [0, 1] like `small_colours`, [3, h, w] from 0 to 255."""
     blurred = box_filter(image.permute(2, 0, 1).contiguous(), _BLUR)
-    return F.adaptive_avg_pool2d(blurred, tuple(size)).mul_(WHITE)
+    return F.adaptive_avg_pool2d(blurred, (size[0], size[1])).mul_(WHITE)
 
 
 def nearest_views(cameras: Sequence[Camera], count: int) -> list[list[int]]:

@@ -170,11 +170,15 @@ def _conflicts(
         devices = [o for o in of_setting if o.device.partition(":")[0] != e.device.partition(":")[0]]
         planned = [o for o in passed if o.effects != v.effects and replace(o.entry, seed=e.seed).key == e.key]
         measures = list(_other_functions(e, fixed, [o.entry for o in passed]))
-        if len(scenes) > 1 and e.scene_hash != board_hashes.get((e.dataset, e.scene)):
+        if (
+            len(scenes) > 1
+            and e.scene_hash != board_hashes.get((e.dataset, e.scene))
+            and not v.of_listed_capture
+        ):
             reason = (
                 f"{v.run}: scene {e.scene!a} has hash {e.scene_hash[:12]}, in another run it has "
-                f"{min(scenes - {e.scene_hash})[:12]}: other photos, split or size, so their numbers cannot "
-                "be compared; give it another --dataset"
+                f"{min(scenes - {e.scene_hash})[:12]}: other photos, split, size or poses, so their numbers "
+                "cannot be compared; give it another --dataset"
             )
         elif others:
             reason = f"{v.run} and {others[0].run} are the same cell with different numbers; give only one"

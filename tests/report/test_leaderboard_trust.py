@@ -14,16 +14,21 @@ import pytest
 import yaml
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.datasets.capture_hashes import capture_hash
 from ambiguous_wild.harness.measures import measure_images, metrics
 from ambiguous_wild.harness.result_file import config_identity
-from ambiguous_wild.io.images import read_png_rgb
+from ambiguous_wild.io.files import sha256_file, write_json
+from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics import lpips
+from ambiguous_wild.report import board_reproduce
 from ambiguous_wild.report.audit_numbers import REPORTED
 from ambiguous_wild.report.board import read_board, write_board
 from ambiguous_wild.report.board_edit import check, remove
 from ambiguous_wild.report.board_publish import publish
 from ambiguous_wild.report.board_reproduce import command as command_of
+from ambiguous_wild.simulate.presets import preset, resized
+from ambiguous_wild.simulate.spec_file import plain_spec
 from tests.report.board_runs import add, aw, change_image, change_result, one_run, write_run
 from tests.tiny_scene import write_tiny_scene as write_scene
 
@@ -239,6 +244,53 @@ def test_a_command_is_quoted_whatever_the_configuration_holds(one: Path, tmp_pat
     change_result(one, lambda r: r.update(config_hash=config["config_hash"], options=config["options"]))
     done = add(tmp_path / "board", one)
     assert done.exit_code == 2 and "the invisible character" in done.stdout
+
+
+def scene_of_capture(root: Path, *, moved: float = 0.0) -> Path:
+    """The scene `root`/scenes/coats of the suite's capture `root`/captures/coats, with a point of its own."""
+    capture, scene = root / "captures" / "coats", write_scene(root / "scenes" / "coats")
+    write_png(capture / "train" / "0.png", np.full((4, 6, 3), 90, np.uint8))
+    write_json(capture / "truth" / "cameras.json", {"train": [0.25]})
+    with (scene / "sparse/0/points3D.txt").open("a") as points:
+        points.write(f"401 {moved} 0 4 9 9 9 0.5\n")
+    for photo in sorted((scene / "images").iterdir()):
+        write_png(scene / "images_2" / photo.name, read_png_rgb(photo)[::2, ::2])
+    spec = plain_spec(resized(preset("coats"), None, 480))
+    write_json(scene / "truth" / "capture.json", {"preset": "coats", "seed": 5, "spec": spec})
+    files = {
+        path.relative_to(scene).as_posix(): {"sha256": sha256_file(path), "bytes": path.stat().st_size}
+        for path in sorted(scene.rglob("*"))
+        if path.is_file()
+    }
+    built = {"name": "coats", "factor": 2, "capture": "../../captures/coats", "chosen": {"mapper": "auto"}}
+    write_json(scene / "scene.json", {"schema_version": 1, "files": files, **built})
+    return scene
+
+
+def test_another_machines_poses_of_a_listed_capture_are_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = scene_of_capture(tmp_path / "first")
+    listed = {"480": {"coats": capture_hash(tmp_path / "first" / "captures" / "coats")}}
+    monkeypatch.setattr(board_reproduce, "listed_hashes", lambda: listed)
+    board = tmp_path / "board"
+    assert add(board, write_run(tmp_path / "runs", first), dataset="aw-sim").exit_code == 0
+
+    def offered(root: Path, seed: int) -> str:
+        """What is said of a run on the scene with other points."""
+        run = write_run(root / "runs", root / "scenes" / "coats", "refinesplat", seed)
+        return add(board, run, "--dry-run", dataset="aw-sim").output
+
+    other = tmp_path / "other"
+    scene = scene_of_capture(other, moved=0.01)
+    assert "1 added" in offered(other, 0)
+    write_png(scene / "masks" / "train" / "train_0.png", np.full((24, 32), 255, np.uint8))
+    assert "cannot be compared" in offered(other, 2)  # something was put into it
+    shutil.rmtree(scene / "masks")
+    write_png(other / "captures" / "coats" / "train" / "0.png", np.full((4, 6, 3), 91, np.uint8))
+    assert "cannot be compared" in offered(other, 3)  # other pixels
+    shutil.rmtree(other / "captures")
+    assert "cannot be compared" in offered(other, 4)
 
 
 def test_one_run_under_two_datasets_is_refused(board: Path, one: Path) -> None:

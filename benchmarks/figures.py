@@ -32,6 +32,7 @@ REFERENCES = ("3dgs+truth", "3dgs-clean", CEILING)
 LENGTH = 1000  # iterations of the tables
 LONGER = (1000, 3000, 7000, 30000)  # of the table of lengths
 RANKED_ON = ("aw-sim", "composites")
+SIZES = {240: RANKED_ON, 480: ("aw-sim-large", "composites-large")}  # longer side of the photos, about, px
 SUITE = get_suite("aw-sim").tables
 PASTED = ("cutouts", "patches")
 GROUPS = {
@@ -126,6 +127,20 @@ def lengths() -> list[str]:
     ]
 
 
+def sizes() -> list[str]:
+    """PSNR and mask IoU by size of the photos, of the captures that were trained on large ones."""
+    lines = []
+    for n in LONGER:
+        found = {side: board(*datasets, only="0", iterations=n) for side, datasets in SIZES.items()}
+        for name in found[max(SIZES)]:
+            lines += [
+                line([name, str(n), str(side), *scores(of[name], (*METHODS, CEILING))])
+                for side, of in found.items()
+                if name in of
+            ]
+    return lines
+
+
 def suite() -> list[str]:
     """What the suite's captures show, and how ambiguous they are."""
     measured, lines = measured_ambiguity(), []
@@ -212,7 +227,7 @@ TABLES: dict[str, dict[str, Callable[[], list[str]]]] = {
     "README.md": {"means": means},
     "docs/datasets.md": {"suite": suite},
     "docs/refinesplat.md": {"scenes": scenes},
-    "docs/training.md": {"lengths": lengths},
+    "docs/training.md": {"lengths": lengths, "sizes": sizes},
     "docs/baselines.md": {"baselines": baselines},
     "docs/leaderboard.md": {"agreement": agreement},
 }

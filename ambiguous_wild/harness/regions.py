@@ -147,7 +147,7 @@ def why_nothing_covered(masks: Iterable[np.ndarray | None]) -> str:
     """Return why the exact masks of the train views cannot cover any pixel; empty if they may."""
     exact = [mask for mask in masks if mask is not None]
     if not exact:
-        return "no exact masks of the train photos (truth/distractor)"
+        return "no exact masks of the train photos, or of another size (truth/distractor)"
     return "" if any(mask.any() for mask in exact) else "no train photo shows a distractor"
 
 

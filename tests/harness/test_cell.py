@@ -28,6 +28,7 @@ from ambiguous_wild.harness.cell import (
 from ambiguous_wild.harness.grid import plan_cells
 from ambiguous_wild.harness.run_cost import peak_rss_mb, reset_peak
 from ambiguous_wild.io.files import write_json
+from ambiguous_wild.io.images import read_gray, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.methods import registry
 from ambiguous_wild.methods.registry import load_plugin
@@ -67,6 +68,10 @@ def test_a_result_says_why_there_are_no_masks_to_compare(tmp_path):
     assert "no_masks" not in masking.result(error="lost")["facts"]
     report = CellReport(tmp_path, "trained", result=masking.result())
     assert f"{late}, a run too short" in outcome_line(report)
+    for path in (scene / "truth/distractor").iterdir():
+        write_png(path, read_gray(path)[::2, ::2])
+    facts = masking.result()["facts"]
+    assert facts["no_masks"] == "the exact masks are not of the photos' size; build the scene with --factor 1"
     for path in (scene / "truth/distractor").iterdir():
         path.rename(path.with_name(f"test_{path.name}"))  # truth of other photos alone
     assert "no_masks" not in masking.result()["facts"]

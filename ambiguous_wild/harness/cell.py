@@ -272,19 +272,17 @@ class Cell:
 
     def _why_no_masks(self, cost: Cost) -> str:
         """Return why no masks could be compared with exact ones; empty if no train photo has one."""
-        exact = [v for v in self.scene.train if self.scene.truth_file("distractor", v).is_file()]
-        if not exact:
+        if not any(self.scene.truth_file("distractor", view).is_file() for view in self.scene.train):
             return ""
-        if self.method.program is not None:
-            return "the program wrote no masks"
-        from ambiguous_wild.harness.regions import exact_distractor
+        from ambiguous_wild.harness.regions import other_size
         from ambiguous_wild.methods.mask_policies import makes_masks
 
-        if not makes_masks(self.method.build(self.options)):
+        if self.method.program is None and not makes_masks(self.method.build(self.options)):
             return "the method makes no masks"
-        if exact_distractor(self.scene, exact[0]) is None:
-            factor = self.scene.info.get("loaded_factor")
-            return f"the exact masks are not of the photos' size; build the scene with --factor {factor}"
+        if why := other_size(self.scene):
+            return why
+        if self.method.program is not None:
+            return "the program wrote no masks"
         return f"{NOT_BEGUN} at {cost.get('iterations', self.train.iterations)} iterations"
 
 

@@ -147,7 +147,7 @@ def why_nothing_covered(masks: Iterable[np.ndarray | None]) -> str:
     """Return why the exact masks of the train views cannot cover any pixel; empty if they may."""
     exact = [mask for mask in masks if mask is not None]
     if not exact:
-        return "no exact masks of the train photos, or of another size (truth/distractor)"
+        return "no exact masks of the train photos (truth/distractor)"
     return "" if any(mask.any() for mask in exact) else "no train photo shows a distractor"
 
 
@@ -264,7 +264,7 @@ def _find_regions(scene: Scene) -> Regions:
         else:
             pixels[metric] = found
     masks_of_train = [exact_distractor(scene, view) for view in scene.train]
-    visibility = train_visibility(scene, masks_of_train)
+    visibility = other_size(scene) or train_visibility(scene, masks_of_train)
     if isinstance(visibility, str):
         return Regions(pixels, missing | dict.fromkeys((COVERED, UNCOVERED, SUPPORTED), visibility))
     pixels[SUPPORTED] = {name: shown >= SUPPORTED_FROM for name, (shown, _) in visibility.items()}
@@ -285,6 +285,14 @@ def _find_regions(scene: Scene) -> Regions:
 def exact_distractor(scene: Scene, view: View) -> np.ndarray | None:
     """Return the exact mask of a photo, [H, W] bool, True on distractors; None if the capture has none."""
     return _exact(scene, view, "distractor")
+
+
+def other_size(scene: Scene) -> str:
+    """Return that the exact masks of train photos are of another size than these; empty if one is not."""
+    there = [view for view in scene.train if scene.truth_file("distractor", view).exists()]
+    if not there or any(exact_distractor(scene, view) is not None for view in there):
+        return ""
+    return "the exact masks are not of the photos' size; load the scene at the factor it was built for"
 
 
 def exact_shadow(scene: Scene, view: View) -> np.ndarray | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from ambiguous_wild.report.board import (
 )
 from ambiguous_wild.report.board_reproduce import Scenes
 from ambiguous_wild.report.board_verify import Unfinished, VerifiedRun, verify
+from ambiguous_wild.report.simulated_suite import difference_from_suite
 
 Outcome = Literal["added", "there already", "replaced", "refused", "unfinished"]
 Tick = Callable[[int, int], None]
@@ -153,11 +155,13 @@ def _conflicts(
     cells = grouped(passed, lambda v: v.entry.key)
     in_scene = grouped(everything, lambda e: (e.dataset, e.scene))
     configs = grouped(everything, lambda e: e.config_hash)
-    board_hashes = {(e.dataset, e.scene): e.scene_hash for e in on_board}
+    board_hashes: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for e in on_board:
+        board_hashes[e.dataset, e.scene].add(e.scene_hash)
+    differences: dict[tuple[Path, str], str] = {}
     conflicts: list[tuple[str, VerifiedRun]] = []
     for v in passed:
         e = v.entry
-        scenes = {o.scene_hash for o in in_scene[e.dataset, e.scene]}
         twins = [o for o in configs[e.config_hash] if o.key != e.key]
         others = [o for o in cells[e.key] if o.entry.result_hash != e.result_hash]
         of_method = [o for o in fixed if o.method == e.method] or [
@@ -170,15 +174,12 @@ def _conflicts(
         devices = [o for o in of_setting if o.device.partition(":")[0] != e.device.partition(":")[0]]
         planned = [o for o in passed if o.effects != v.effects and replace(o.entry, seed=e.seed).key == e.key]
         measures = list(_other_functions(e, fixed, [o.entry for o in passed]))
-        if (
-            len(scenes) > 1
-            and e.scene_hash != board_hashes.get((e.dataset, e.scene))
-            and not v.of_listed_capture
+        if difference := _other_scene(
+            v, in_scene[e.dataset, e.scene], board_hashes[e.dataset, e.scene], differences
         ):
             reason = (
-                f"{v.run}: scene {e.scene!a} has hash {e.scene_hash[:12]}, in another run it has "
-                f"{min(scenes - {e.scene_hash})[:12]}: other photos, split, size or poses, so their numbers "
-                "cannot be compared; give it another --dataset"
+                f"{v.run}: scene {e.scene!a} has hash {e.scene_hash[:12]}, in another run it has another, so "
+                f"their numbers cannot be compared ({difference}); give it another --dataset"
             )
         elif others:
             reason = f"{v.run} and {others[0].run} are the same cell with different numbers; give only one"
@@ -212,6 +213,30 @@ def _conflicts(
             continue
         conflicts.append((reason, v))
     return conflicts
+
+
+def _other_scene(
+    run: VerifiedRun, others: Sequence[Entry], known: set[str], differences: dict[tuple[Path, str], str]
+) -> str:
+    """Return why a run is on another scene than others of its name; empty if it is not.
+
+    Args:
+        run: the run.
+        others: the runs of this scene, also `run`.
+        known: hashes of the scene on the board.
+        differences: what `difference_from_suite` said before, by scene and dataset.
+    """
+    entry, scene = run.entry, run.scene
+    if entry.scene_hash in known or all(other.scene_hash == entry.scene_hash for other in others):
+        return ""
+    if scene is None:
+        return "its scene is not on this machine"
+    if any(other.images != entry.images for other in others):
+        return "other test photos"
+    key = scene.root, entry.dataset
+    if key not in differences:
+        differences[key] = difference_from_suite(scene, entry.dataset)
+    return differences[key]
 
 
 def _other_functions(

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -421,8 +422,11 @@ def write_model_pages(
                 say(f"no model of {label} on {scene}: its run is not below the given folders")
         if not shown:
             continue
-        if len({f.scene_hash for _, f in shown}) > 1:
-            raise AwError(f"runs on scene {scene!r} of {dataset!r} used different photos: publish them apart")
+        # one page shows one state of the scene; another machine may have estimated other poses
+        (state, _), *_ = Counter(f.scene_hash for _, f in shown).most_common(1)
+        for label, _ in (pair for pair in shown if pair[1].scene_hash != state):
+            say(f"no model of {label} on {scene}: its scene has other poses or photos")
+        shown = [pair for pair in shown if pair[1].scene_hash == state]
         name = _page_name(dataset, scene, names)
         # readers of the board have not the runs that a command would train on
         models = [replace(f.model, label=label, retrain="") for label, f in shown]

@@ -14,7 +14,6 @@ from pathlib import Path
 from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import Facts, config_hash, flatten, to_plain
-from ambiguous_wild.datasets.capture_hashes import capture_hash, listed_hashes
 from ambiguous_wild.datasets.suites import simulated_dataset
 from ambiguous_wild.harness.command_lines import length_options, option_text
 from ambiguous_wild.harness.result_file import Options, RunConfig, RunResult, SceneConfig, TrainRecord
@@ -275,29 +274,13 @@ def _stated(scene: Scene) -> str:
         return name
     if not isinstance(truth.get("preset"), str):
         return ""
-    dataset = simulated_dataset(truth, scene.info.get("factor"))
+    dataset = simulated_dataset(truth, scene.info.get("loaded_factor"))
     return dataset if dataset and _is_preset(truth) else SIMULATED
 
 
 def _has_exact_poses(scene: Scene) -> bool:
     chosen = dict(scene.info).get("chosen")
     return isinstance(chosen, dict) and chosen.get("mapper") == "truth"
-
-
-def of_listed_capture(scene: Scene, dataset: str) -> bool:
-    """Tell whether a scene is built, as the suite of `dataset` builds it, from the capture that its list has.
-
-    Then it differs from another machine's only in what structure from motion estimated.
-    """
-    info, truth = dict(scene.info), own_json(scene.root / "truth" / "capture.json")
-    suite, spec, capture = _stated(scene), truth.get("spec"), info.get("capture")
-    if not isinstance(spec, dict) or not isinstance(capture, str) or info["loaded_factor"] != info["factor"]:
-        return False
-    if dataset_of(suite, _has_exact_poses(scene)) != dataset or any(view.keep_path for view in scene.views):
-        return False
-    listed = listed_hashes().get(str(spec.get("width")), {}).get(str(truth.get("preset")))
-    folder = scene.root / capture
-    return suite != SIMULATED and folder.is_dir() and capture_hash(folder) == listed
 
 
 class Scenes:

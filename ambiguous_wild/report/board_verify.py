@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import NoReturn, cast
 
@@ -47,7 +46,6 @@ from ambiguous_wild.report.board_reproduce import (
     Scenes,
     command,
     hardware,
-    of_listed_capture,
     options_hash,
     preparation,
     setting,
@@ -71,11 +69,6 @@ class VerifiedRun:
     psnr: Mapping[str, float]  # by image
     scene: Scene | None  # None: it is not on this machine
     effects: tuple[str, ...] = ()
-
-    @cached_property
-    def of_listed_capture(self) -> bool:
-        """Whether its scene can differ from those of other machines in estimated poses and points alone."""
-        return self.scene is not None and of_listed_capture(self.scene, self.entry.dataset)
 
 
 def verify(run: Path, scenes: Scenes, *, quick: bool = False) -> VerifiedRun:

@@ -14,15 +14,20 @@ from typing import Any
 
 from ambiguous_wild.builder.progress import Bar
 from ambiguous_wild.builder.settings import BuildSettings, Mapper
-from ambiguous_wild.core.errors import AwError, counted
+from ambiguous_wild.core import Scene
+from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.core.errors import AwError, counted, shortlist
 from ambiguous_wild.datasets.capture_hashes import (
     CAPTURES,
+    RECORD,
     CheckedCapture,
     check_capture,
     list_lines,
 )
-from ambiguous_wild.datasets.suites import Simulated, Suite
-from ambiguous_wild.io.files import check_output, folder_lock, is_free, sweep_siblings
+from ambiguous_wild.datasets.suites import Simulated, Suite, simulated_suites
+from ambiguous_wild.io.files import check_output, folder_lock, is_free, own_json, sweep_siblings
+from ambiguous_wild.io.original_photos import capture_folder
+from ambiguous_wild.report.board_reproduce import dataset_of
 from ambiguous_wild.report.suite import PreparedSuite
 from ambiguous_wild.simulate.presets import preset, resized
 from ambiguous_wild.simulate.spec import CaptureSpec
@@ -136,11 +141,10 @@ def prepare_simulated(
 
     make_captures(suite, root, progress=progress, say=say)
     folders = {name: root / (EXACT_SCENES if exact_poses else SCENES) / name for name in suite.scenes}
-    mapper: Mapper = "truth" if exact_poses else "incremental"
+    settings = _settings(suite, exact_poses)
     for number, (name, scene) in enumerate(folders.items(), 1):
         if not scene.exists():
             say(f"building scene {number} of {len(folders)}: {name}")
-        settings = BuildSettings(factor=suite.factor, license=suite.license, mapper=mapper)
         try:
             build_scene(root / CAPTURES / name, scene, settings, progress=progress)
         except OutputExists as error:
@@ -151,3 +155,46 @@ def prepare_simulated(
         except AwError as error:
             raise AwError(f"{name}: {error}") from error
     return PreparedSuite(suite, folders, (), exact_poses)
+
+
+def _settings(suite: Suite, exact_poses: bool) -> BuildSettings:
+    mapper: Mapper = "truth" if exact_poses else "incremental"
+    return BuildSettings(factor=suite.factor, license=suite.license, mapper=mapper)
+
+
+def difference_from_suite(scene: Scene, dataset: str) -> str:
+    """Return why a scene is not what a suite makes of a listed capture; empty if it is.
+
+    Such scenes of two machines differ only in what structure from motion estimated.
+
+    Args:
+        scene: the scene, opened at the factor of a run.
+        dataset: that of the run on the board.
+    """
+    info, name = dict(scene.info), scene.name
+    suites = [
+        (suite, exact)
+        for suite in simulated_suites().values()
+        for exact in (False, True)
+        if name in suite.scenes and dataset_of(suite.dataset, exact) == dataset
+    ]
+    if not suites:
+        return f"{dataset} has no simulated {name}"
+    suite, exact = suites[0]
+    settings, made = info.get("settings"), to_plain(_settings(suite, exact))
+    if not isinstance(settings, dict):
+        return "'aw build-scene' did not build it"
+    if other := [key for key in made if key not in ("name", "license") and settings.get(key) != made[key]]:
+        return f"it was built by other settings ({shortlist(other)})"
+    if info.get("loaded_factor") != suite.factor:
+        return f"the photos were loaded at factor {info.get('loaded_factor')}, not {suite.factor}"
+    if info.get("split") != "folders" or any(view.keep_path for view in scene.views):
+        return "it has masks, or a list of test photos"
+    try:
+        folder = capture_folder(scene.root, info)
+        capture = check_capture(folder, name, suite)
+    except AwError as error:
+        return str(error)
+    if own_json(folder / RECORD).get("files") != own_json(scene.root / RECORD).get("files"):
+        return f"it was not built from {folder}"
+    return "" if capture.listed == capture.sha256 else f"{folder} is not the listed capture"

@@ -26,6 +26,7 @@ from ambiguous_wild.harness.cell import (
     scene_identity,
 )
 from ambiguous_wild.harness.grid import plan_cells
+from ambiguous_wild.harness.regions import find_regions
 from ambiguous_wild.harness.run_cost import peak_rss_mb, reset_peak
 from ambiguous_wild.io.files import write_json
 from ambiguous_wild.io.images import read_gray, write_png
@@ -70,8 +71,9 @@ def test_a_result_says_why_there_are_no_masks_to_compare(tmp_path):
     assert f"{late}, a run too short" in outcome_line(report)
     for path in (scene / "truth/distractor").iterdir():
         write_png(path, read_gray(path)[::2, ::2])
-    facts = masking.result()["facts"]
-    assert facts["no_masks"] == "the exact masks are not of the photos' size; build the scene with --factor 1"
+    assert "not of the photos' size" in masking.result()["facts"]["no_masks"]
+    missing = find_regions(load_scene(scene)).missing
+    assert all("not of the photos' size" in missing[f"psnr_{key}"] for key in ("supported", "covered"))
     for path in (scene / "truth/distractor").iterdir():
         path.rename(path.with_name(f"test_{path.name}"))  # truth of other photos alone
     assert "no_masks" not in masking.result()["facts"]

@@ -141,7 +141,7 @@ def test_another_spec_under_the_name_of_a_suites_preset_is_not_of_the_suite(
 ) -> None:
     spec = replace(resized(preset("coats"), None, width), **change)
     scene = scene_of(tmp_path / "coats", {"preset": "coats", "seed": 5, "spec": plain_spec(spec)})
-    scene = replace(scene, info={**scene.info, "factor": factor})
+    scene = replace(scene, info={**scene.info, "loaded_factor": factor})
     assert Scenes().dataset(tmp_path / "run", scene, "") == dataset
     exact = replace(scene, info={**scene.info, "chosen": {"mapper": "truth"}})
     assert Scenes().dataset(tmp_path / "run", exact, "") == f"{dataset}, exact poses"

@@ -13,15 +13,17 @@ import numpy as np
 import pytest
 import yaml
 
+from ambiguous_wild.builder.settings import BuildSettings
 from ambiguous_wild.core import AwError
+from ambiguous_wild.core.config import to_plain
+from ambiguous_wild.datasets import capture_hashes
 from ambiguous_wild.datasets.capture_hashes import capture_hash
 from ambiguous_wild.harness.measures import measure_images, metrics
 from ambiguous_wild.harness.result_file import config_identity
-from ambiguous_wild.io.files import sha256_file, write_json
+from ambiguous_wild.io.files import own_json, sha256_file, write_json
 from ambiguous_wild.io.images import read_png_rgb, write_png
 from ambiguous_wild.io.scene_folder import load_scene
 from ambiguous_wild.metrics import lpips
-from ambiguous_wild.report import board_reproduce
 from ambiguous_wild.report.audit_numbers import REPORTED
 from ambiguous_wild.report.board import read_board, write_board
 from ambiguous_wild.report.board_edit import check, remove
@@ -246,24 +248,33 @@ def test_a_command_is_quoted_whatever_the_configuration_holds(one: Path, tmp_pat
     assert done.exit_code == 2 and "the invisible character" in done.stdout
 
 
-def scene_of_capture(root: Path, *, moved: float = 0.0) -> Path:
+def files_of(folder: Path) -> dict[str, dict[str, object]]:
+    return {
+        path.relative_to(folder).as_posix(): {"sha256": sha256_file(path), "bytes": path.stat().st_size}
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "scene.json"
+    }
+
+
+def scene_of_capture(
+    root: Path, *, moved: float = 0.0, grey: int = 90, sfm_seed: int = 0, **more: object
+) -> Path:
     """The scene `root`/scenes/coats of the suite's capture `root`/captures/coats, with a point of its own."""
     capture, scene = root / "captures" / "coats", write_scene(root / "scenes" / "coats")
-    write_png(capture / "train" / "0.png", np.full((4, 6, 3), 90, np.uint8))
+    write_png(capture / "train" / "0.png", np.full((4, 6, 3), grey, np.uint8))
     write_json(capture / "truth" / "cameras.json", {"train": [0.25]})
     with (scene / "sparse/0/points3D.txt").open("a") as points:
         points.write(f"401 {moved} 0 4 9 9 9 0.5\n")
     for photo in sorted((scene / "images").iterdir()):
         write_png(scene / "images_2" / photo.name, read_png_rgb(photo)[::2, ::2])
     spec = plain_spec(resized(preset("coats"), None, 480))
-    write_json(scene / "truth" / "capture.json", {"preset": "coats", "seed": 5, "spec": spec})
-    files = {
-        path.relative_to(scene).as_posix(): {"sha256": sha256_file(path), "bytes": path.stat().st_size}
-        for path in sorted(scene.rglob("*"))
-        if path.is_file()
-    }
-    built = {"name": "coats", "factor": 2, "capture": "../../captures/coats", "chosen": {"mapper": "auto"}}
-    write_json(scene / "scene.json", {"schema_version": 1, "files": files, **built})
+    files = {name: str(entry["sha256"]) for name, entry in files_of(capture).items()}
+    for folder in (capture, scene):
+        record = {"preset": "coats", "seed": 5, "spec": spec, "files": files}
+        write_json(folder / "truth" / "capture.json", record)
+    built = {"name": "coats", "factor": 2, "split": "folders", "capture": "../../captures/coats"}
+    built |= {"settings": to_plain(BuildSettings(factor=2, seed=sfm_seed)), "schema_version": 1, **more}
+    write_json(scene / "scene.json", {"files": files_of(scene), **built})
     return scene
 
 
@@ -272,25 +283,44 @@ def test_another_machines_poses_of_a_listed_capture_are_taken(
 ) -> None:
     first = scene_of_capture(tmp_path / "first")
     listed = {"480": {"coats": capture_hash(tmp_path / "first" / "captures" / "coats")}}
-    monkeypatch.setattr(board_reproduce, "listed_hashes", lambda: listed)
+    monkeypatch.setattr(capture_hashes, "listed_hashes", lambda: listed)
     board = tmp_path / "board"
     assert add(board, write_run(tmp_path / "runs", first), dataset="aw-sim").exit_code == 0
 
-    def offered(root: Path, seed: int) -> str:
-        """What is said of a run on the scene with other points."""
-        run = write_run(root / "runs", root / "scenes" / "coats", "refinesplat", seed)
-        return add(board, run, "--dry-run", dataset="aw-sim").output
+    def offered(scene: Path, **more: object) -> str:
+        """What is said of a run on another scene."""
+        run = write_run(scene.parent / "runs", scene, "refinesplat", **more)
+        return " ".join(add(board, run, "--dry-run", dataset="aw-sim").output.split())
 
-    other = tmp_path / "other"
-    scene = scene_of_capture(other, moved=0.01)
-    assert "1 added" in offered(other, 0)
-    write_png(scene / "masks" / "train" / "train_0.png", np.full((24, 32), 255, np.uint8))
-    assert "cannot be compared" in offered(other, 2)  # something was put into it
-    shutil.rmtree(scene / "masks")
-    write_png(other / "captures" / "coats" / "train" / "0.png", np.full((4, 6, 3), 91, np.uint8))
-    assert "cannot be compared" in offered(other, 3)  # other pixels
-    shutil.rmtree(other / "captures")
-    assert "cannot be compared" in offered(other, 4)
+    other = scene_of_capture(tmp_path / "other", moved=0.01)
+    assert "1 added" in offered(other)
+    write_png(other / "masks" / "train" / "train_0.png", np.full((24, 32), 255, np.uint8))
+    assert "it has masks" in offered(other, seed=1)
+    shutil.rmtree(other / "masks")
+    (other / "test_list.txt").write_text("test_0.png\n")
+    write_json(other / "scene.json", {**own_json(other / "scene.json"), "files": files_of(other)})
+    assert "other test photos" in offered(other, seed=2)
+
+    for number, (difference, more) in enumerate({
+        "built by other settings (seed)": {"sfm_seed": 9},
+        "or a list of test photos": {"split": "list"},
+        "is not the listed capture": {"grey": 91},
+        "loaded at factor 1": {"factor": 1},
+    }.items()):  # fmt: skip
+        assert difference in offered(scene_of_capture(tmp_path / str(number), moved=0.01, **more)), difference
+
+    remade = scene_of_capture(tmp_path / "remade", moved=0.01, grey=91)
+    shutil.rmtree(tmp_path / "remade" / "captures")
+    shutil.copytree(tmp_path / "first" / "captures", tmp_path / "remade" / "captures")
+    assert "was not built from" in offered(remade)
+    shutil.rmtree(tmp_path / "remade" / "captures")
+    assert "move scene or photos back" in offered(remade, seed=1)
+    # once there, it needs no capture
+    kept = scene_of_capture(tmp_path / "kept", moved=0.01)
+    run = write_run(tmp_path / "runs", kept, "refinesplat")
+    assert "1 added" in add(board, run, dataset="aw-sim").output
+    shutil.rmtree(tmp_path / "kept" / "captures")
+    assert "1 there already" in add(board, run, dataset="aw-sim").output
 
 
 def test_one_run_under_two_datasets_is_refused(board: Path, one: Path) -> None:

@@ -188,8 +188,9 @@ def difference_from_suite(scene: Scene, dataset: str) -> str:
         return f"it was built by other settings ({shortlist(other)})"
     if info.get("loaded_factor") != suite.factor:
         return f"the photos were loaded at factor {info.get('loaded_factor')}, not {suite.factor}"
-    if info.get("split") != "folders" or any(view.keep_path for view in scene.views):
-        return "it has masks, or a list of test photos"
+    masks = [v.keep_path.relative_to(scene.root).as_posix() for v in scene.views if v.keep_path is not None]
+    if info.get("split") != "folders" or not {*masks} <= {*scene.info["files"]}:
+        return "it was given masks, or a list of test photos"
     try:
         folder = capture_folder(scene.root, info)
         capture = check_capture(folder, name, suite)

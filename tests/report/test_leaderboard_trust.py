@@ -295,7 +295,7 @@ def test_another_machines_poses_of_a_listed_capture_are_taken(
     other = scene_of_capture(tmp_path / "other", moved=0.01)
     assert "1 added" in offered(other)
     write_png(other / "masks" / "train" / "train_0.png", np.full((24, 32), 255, np.uint8))
-    assert "it has masks" in offered(other, seed=1)
+    assert "it was given masks" in offered(other, seed=1)
     shutil.rmtree(other / "masks")
     (other / "test_list.txt").write_text("test_0.png\n")
     write_json(other / "scene.json", {**own_json(other / "scene.json"), "files": files_of(other)})

@@ -158,7 +158,7 @@ def _conflicts(
     board_hashes: dict[tuple[str, str], set[str]] = defaultdict(set)
     for e in on_board:
         board_hashes[e.dataset, e.scene].add(e.scene_hash)
-    differences: dict[tuple[Path, str], str] = {}
+    differences: dict[tuple[str, str], str] = {}
     conflicts: list[tuple[str, VerifiedRun]] = []
     for v in passed:
         e = v.entry
@@ -216,7 +216,7 @@ def _conflicts(
 
 
 def _other_scene(
-    run: VerifiedRun, others: Sequence[Entry], known: set[str], differences: dict[tuple[Path, str], str]
+    run: VerifiedRun, others: Sequence[Entry], known: set[str], differences: dict[tuple[str, str], str]
 ) -> str:
     """Return why a run is on another scene than others of its name; empty if it is not.
 
@@ -224,7 +224,7 @@ def _other_scene(
         run: the run.
         others: the runs of this scene, also `run`.
         known: hashes of the scene on the board.
-        differences: what `difference_from_suite` said before, by scene and dataset.
+        differences: what `difference_from_suite` said before, by hash of the scene and dataset.
     """
     entry, scene = run.entry, run.scene
     if entry.scene_hash in known or all(other.scene_hash == entry.scene_hash for other in others):
@@ -233,7 +233,7 @@ def _other_scene(
         return "its scene is not on this machine"
     if any(other.images != entry.images for other in others):
         return "other test photos"
-    key = scene.root, entry.dataset
+    key = entry.scene_hash, entry.dataset
     if key not in differences:
         differences[key] = difference_from_suite(scene, entry.dataset)
     return differences[key]

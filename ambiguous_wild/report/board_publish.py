@@ -9,7 +9,6 @@ import json
 import os
 import re
 import shutil
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -422,21 +421,18 @@ def write_model_pages(
                 say(f"no model of {label} on {scene}: its run is not below the given folders")
         if not shown:
             continue
-        # one page shows one state of the scene; another machine may have estimated other poses
-        (state, _), *_ = Counter(f.scene_hash for _, f in shown).most_common(1)
-        for label, _ in (pair for pair in shown if pair[1].scene_hash != state):
-            say(f"no model of {label} on {scene}: its scene has other poses or photos")
-        shown = [pair for pair in shown if pair[1].scene_hash == state]
-        name = _page_name(dataset, scene, names)
-        # readers of the board have not the runs that a command would train on
-        models = [replace(f.model, label=label, retrain="") for label, f in shown]
-        opened = open_scene(shown[0][1].run)
-        text, _ = page_text(opened, models, title=f"{dataset}: {scene}", mixed=mixed_tests(opened))
-        (out / MODELS).mkdir(exist_ok=True)
-        (out / MODELS / name).write_text(text, encoding="utf-8")
-        for label, _ in shown:
-            for entry in groups[label]:
-                links[entry.result_hash] = f"{MODELS}/{name}#left={quote(label, safe='')}"
+        # a page shows one state of the scene: another machine may have estimated other poses
+        for of_state in grouped(shown, lambda pair: pair[1].scene_hash).values():
+            name = _page_name(dataset, scene, names)
+            # readers of the board have not the runs that a command would train on
+            models = [replace(f.model, label=label, retrain="") for label, f in of_state]
+            opened = open_scene(of_state[0][1].run)
+            text, _ = page_text(opened, models, title=f"{dataset}: {scene}", mixed=mixed_tests(opened))
+            (out / MODELS).mkdir(exist_ok=True)
+            (out / MODELS / name).write_text(text, encoding="utf-8")
+            for label, _ in of_state:
+                for entry in groups[label]:
+                    links[entry.result_hash] = f"{MODELS}/{name}#left={quote(label, safe='')}"
     return links, len(names)
 
 

@@ -179,7 +179,7 @@ def difference_from_suite(scene: Scene, dataset: str) -> str:
         if name in suite.scenes and dataset_of(suite.dataset, exact) == dataset
     ]
     if not suites:
-        return f"{dataset} has no simulated {name}"
+        return "other photos, split, size or poses"
     suite, exact = suites[0]
     settings, made = info.get("settings"), to_plain(_settings(suite, exact))
     if not isinstance(settings, dict):
@@ -194,7 +194,7 @@ def difference_from_suite(scene: Scene, dataset: str) -> str:
     try:
         folder = capture_folder(scene.root, info)
         capture = check_capture(folder, name, suite)
-    except AwError as error:
+    except (AwError, OSError, ValueError, RecursionError) as error:  # scene.json may be a stranger's
         return str(error)
     if own_json(folder / RECORD).get("files") != own_json(scene.root / RECORD).get("files"):
         return f"it was not built from {folder}"

@@ -11,6 +11,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from ambiguous_wild.core import AwError
+from ambiguous_wild.report import board_edit
 from tests.chromium import Browser, needs_chromium
 from tests.report.board_runs import add, aw, own_scene
 from tests.viewing.wall_runs import write_shown_run
@@ -53,6 +54,21 @@ def test_every_entry_leads_to_its_model(root: Path, tmp_path: Path) -> None:
     # Without --models an earlier page's models go, and nothing of them is left in the page.
     assert aw("publish", "--board", root / "board", "-o", site).exit_code == 0
     assert not (site / "models").exists() and facts(site / "index.html")["models"] == {}
+
+
+def test_each_state_of_a_scene_has_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(board_edit, "difference_from_suite", lambda scene, dataset: "")
+    for number, method in enumerate(("3dgs", "refinesplat")):
+        scene = own_scene(tmp_path / str(number) / "porch")
+        with (scene / "sparse/0/points3D.txt").open("a") as points:
+            points.write(f"402 {number / 100} 0 4 9 9 9 0.5\n")
+        write_shown_run(tmp_path / "runs" / str(number), scene, method, count=300)
+    board, site = tmp_path / "board", tmp_path / "site"
+    assert "2 added" in add(board, tmp_path / "runs", dataset="Tiny").output
+    done = aw("publish", "--board", board, "-o", site, "--models", tmp_path / "runs")
+    assert "2 pages with models" in done.output
+    assert [len(facts(page)["models"]) for page in (site / "models").iterdir()] == [1, 1]
+    assert len({link.partition("#")[0] for link in facts(site / "index.html")["models"].values()}) == 2
 
 
 def test_entries_without_a_model_are_named(root: Path, tmp_path: Path) -> None:

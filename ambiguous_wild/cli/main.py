@@ -19,7 +19,7 @@ import click
 
 from ambiguous_wild import __version__
 from ambiguous_wild.core.errors import AwError, disk_line, logged_to, unknown
-from ambiguous_wild.io.terminal import line_width, say, wrapped
+from ambiguous_wild.io.terminal import say
 
 # Heading of `aw --help` -> command -> (module, one line of help), in the order of the work. Help is here so that
 # `aw --help` imports no command.
@@ -150,15 +150,13 @@ def cli(ctx: click.Context, quiet: bool, verbose: bool) -> None:
 
 def _printed() -> logging.Handler:
     """Return a handler that prints records above a progress bar."""
-    from tqdm import tqdm
-
     from ambiguous_wild.cli.run_progress import VERBOSE
 
     handler = logging.Handler()
     handler.set_name(VERBOSE)
 
     def emit(record: logging.LogRecord) -> None:
-        tqdm.write(wrapped(f"  {record.getMessage()}", line_width(err=True)), file=sys.stderr)
+        say(f"  {record.getMessage()}")
 
     handler.emit = emit  # type: ignore[method-assign]
     return handler

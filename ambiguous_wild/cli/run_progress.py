@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ambiguous_wild.core.errors import AwError
-from ambiguous_wild.core.names import plain
 from ambiguous_wild.harness.callbacks import Lines, outcome_line, run_name
-from ambiguous_wild.io.terminal import keep_clock_running, line_width, say, wrapped
+from ambiguous_wild.io.terminal import keep_clock_running, say
 
 if TYPE_CHECKING:
     from ambiguous_wild.harness.benchmark import BenchReport
@@ -80,7 +79,7 @@ class ProgressBar(Lines):
         self.bar.set_description(text := record.getMessage())
         printed = any(h.name == VERBOSE for h in logging.getLogger("ambiguous_wild").handlers)
         if not printed and (self.bar.disable or record.levelno > logging.INFO):
-            self.bar.write(wrapped(f"    {plain(text)}", line_width(err=True)), file=sys.stderr)
+            say(f"    {text}")
 
     def _close(self) -> None:
         logging.getLogger("ambiguous_wild").removeHandler(self.phases)

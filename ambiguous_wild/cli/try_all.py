@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -203,9 +202,7 @@ class _ProgressAndPage(Recorded):
         super().tick(trainer)
         if self.page.tick(trainer) and not self.shown:
             self.shown = True
-            self.bar.write(
-                f"    look at it while it trains: {self.page.folder / 'index.html'}", file=sys.stderr
-            )
+            say(f"    look at it while it trains: {self.page.folder / 'index.html'}")
 
 
 def _announced(source: Path, scene: Path, seconds: float) -> str:

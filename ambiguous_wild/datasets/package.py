@@ -32,12 +32,20 @@ from ambiguous_wild.datasets.release_facts import (
     simulated_license,
     with_simulated,
 )
-from ambiguous_wild.io.files import atomic_dir, check_output, check_replaceable, own_json, write_json
+from ambiguous_wild.io.files import (
+    atomic_dir,
+    check_output,
+    check_replaceable,
+    own_json,
+    sha256_file,
+    write_json,
+)
 from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, without_suffix
 
 FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")
 PHOTOS = ("scene", "photo", "split", "source", "done", "metadata_removed", "person")
 FIXED = ("README.md", "croissant.json", "files.csv", "photos.csv", "checksums.sha256", "checksums.md5")
+CARDS = ("README.md", "croissant.json")  # a person may have edited them
 _TIME = (1980, 1, 1, 0, 0, 0)  # the earliest time that zip can hold
 NOT_STATED = "not stated"  # the licence in scene.json
 _DROPPED = ("seconds", "capture")  # keys of scene.json that differ between two builds of one scene
@@ -89,8 +97,12 @@ def package_scenes(
     check_output(output, outside={f"the scene {name}": root for root, name, _ in opened})
     sums = output / "checksums.sha256"
     lines = sums.read_text(encoding="utf-8", errors="replace").splitlines() if sums.is_file() else []
-    listed = {line[66:] for line in lines}
+    listed = {line[66:]: line[:64] for line in lines}
     check_replaceable(output, "package", {*FIXED, *listed} if "croissant.json" in listed else None)
+    for name in CARDS:
+        path = output / name
+        if name in listed and path.is_file() and sha256_file(path) != listed[name]:
+            raise AwError(f"{path} was edited and would be replaced: move it, or choose another -o")
     bar = Bar(progress)
     file_rows: list[list[Any]] = []
     photo_rows: list[list[Any]] = []
@@ -114,7 +126,7 @@ def package_scenes(
         write_json(folder / "croissant.json", data)
         (folder / "README.md").write_text(card(info, facts, people, stripped, keep_metadata), "utf-8")
         for kind in ("sha256", "md5"):
-            every = [*packed, *(_described(folder / n, "") for n in ("croissant.json", "README.md"))]
+            every = [*packed, *(_described(folder / n, "") for n in CARDS)]
             text = "".join(f"{getattr(f, kind)}  {f.name}\n" for f in sorted(every, key=lambda f: f.name))
             (folder / f"checksums.{kind}").write_text(text, encoding="utf-8")
     bar.finish()

@@ -84,7 +84,11 @@ def say(text: str, *, out: bool = False, fg: str = "", only: str = "") -> None:
         sys.modules.get("tqdm"), "tqdm", None
     )  # a bar on the line is cleared, and drawn again below
     with bars.external_write_mode() if bars is not None else nullcontext():
-        click.echo(line, err=not out)
+        try:
+            click.echo(line, err=not out)
+        except BrokenPipeError:  # nobody reads how a command goes on (`aw bench 2>&1 | head`): it goes on
+            if out:
+                raise
 
 
 def keep_clock_running(bar: tqdm[Any]) -> None:

@@ -84,7 +84,7 @@ def statement(folders: Sequence[Path]) -> Statement:
     sentences += _later(runs)
     if left_out:
         named = shortlist(map(_short, left_out))
-        sentences.append(f"{counted(len(left_out), 'run')} failed or did not end ({named}).")
+        sentences.append(f"{counted(len(left_out), 'run')} failed, did not end or changed since ({named}).")
     silent = [run for run in runs if not run.words]
     if silent:
         sentences.append(

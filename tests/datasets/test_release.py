@@ -234,6 +234,11 @@ def test_nothing_of_the_users_is_replaced(scene, package, tmp_path):
             package_scenes([scene], copy, INFO, look_for_people=False)
         assert (copy / name).read_text() == "mine"
         (copy / name).unlink()
+    card = (copy / "README.md").read_text(encoding="utf-8")
+    (copy / "README.md").write_text(card + "Cite us.", encoding="utf-8")
+    with pytest.raises(AwError, match=r"README\.md was edited"):
+        package_scenes([scene], copy, INFO, look_for_people=False)
+    (copy / "README.md").write_text(card, encoding="utf-8")
     assert package_scenes([scene], copy, INFO, look_for_people=False).stripped == 2
 
 

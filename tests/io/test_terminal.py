@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 
@@ -63,6 +64,16 @@ def test_what_is_said_fits_the_terminal_and_stays_whole_in_a_file(
     say(LINE, out=True)
     lines = terminal.getvalue().splitlines()
     assert max(map(len, lines)) <= 40 < len(LINE) and line_width() == 40
+
+
+def test_a_reader_of_progress_that_leaves_does_not_stop_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("stdout", "stderr"):
+        read, write = os.pipe()
+        os.close(read)
+        monkeypatch.setattr(sys, name, os.fdopen(write, "w", buffering=1))
+    say(LINE)
+    with pytest.raises(BrokenPipeError):
+        say(LINE, out=True)
 
 
 def test_a_clock_runs_while_nothing_is_done_and_ends_with_its_bar(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -124,7 +124,7 @@ def test_failures_and_runs_without_settings_are_named(runs, tmp_path: Path) -> N
     for name in ("3dgs/seed1/config.yaml", "absgs/seed0/metrics.json"):
         (folder / "scene" / name).unlink()
     text = " ".join(statement([folder]).sentences)
-    assert "1 run failed or did not end (absgs on scene)" in text
+    assert "1 run failed, did not end or changed since (absgs on scene)" in text
     assert "The command of 1 of 3 runs is not known" in text
     (tmp_path / "none").mkdir()
     assert "no run in" in aw("statement", tmp_path / "none").stderr

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from ambiguous_wild.splat.method_hooks import Schedule
+from ambiguous_wild.splat.density import DensityConfig
+from ambiguous_wild.splat.method_hooks import MethodHooks, Schedule
 from ambiguous_wild.splat.run_schedule import RunSchedule
 from ambiguous_wild.splat.train_config import TrainConfig
 from ambiguous_wild.splat.trainer import Trainer
 from ambiguous_wild.splat.training_loop import advance, train
 from ambiguous_wild.splat.training_records import ROWS, Timeline
+from tests.splat.scenes import trained
 
 COUNTS = (1, 3, 7, 8, 16)
 
@@ -24,6 +26,7 @@ class Empty(Trainer):
 
     gaussians = range(5)  # type: ignore[assignment]
     meter = marks = device_check = None  # type: ignore[assignment]
+    opacity_reset = False
     step_s = 0.01
     between_s = 0.0  # pass after a step, before the clock is read again
 
@@ -118,3 +121,12 @@ def test_steps_longer_than_the_distance_of_probes_have_one_each(tmp_path):
     run = Empty(TrainConfig(iterations=5, probes=16), tmp_path)
     train(run)
     assert [row["iteration"] for row in run.probed()] == [1, 2, 3, 4, 5]
+
+
+def test_no_probe_falls_on_a_reset_of_opacities(scene, tmp_path):
+    density = DensityConfig(resets=(15_000.0,), min_reset_rest=1, min_reset_spacing=1)
+    parts = MethodHooks(density_config=density)
+    run = trained(scene, tmp_path, parts=parts, probe=lambda draw: 20.0, iterations=40, probes=4)
+    assert run.field.density.last_reset == 20
+    probed = [row["iteration"] for row in run.timeline.rows if row["psnr_probe"] is not None]
+    assert probed == [10, 30, 40]

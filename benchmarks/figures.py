@@ -83,7 +83,8 @@ def label(row: Mapping[str, str]) -> str:
 def cells_of(psnr: Mapping[str, float], digits: int) -> list[str]:
     """PSNR of methods as printed, the best of the ranked in bold."""
     cells = {name: f"{x:.{digits}f}" for name, x in psnr.items()}
-    best = max((float(cell) for name, cell in cells.items() if name in RANKED), default=None)
+    ranked = [float(cell) for name, cell in cells.items() if name in RANKED]
+    best = max(ranked) if len(ranked) > 1 else None
     return [f"**{c}**" if name in RANKED and float(c) == best else c for name, c in cells.items()]
 
 

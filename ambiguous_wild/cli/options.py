@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import re
@@ -282,7 +283,8 @@ def threads_words(threads: int | None) -> list[str]:
 
 def print_command(*words: str | Path) -> None:
     """Print a command of ours as one line to copy."""
-    click.echo(f"\n$ aw {shlex.join(map(str, words))}", err=True)
+    with contextlib.suppress(BrokenPipeError):  # as `say` does
+        click.echo(f"\n$ aw {shlex.join(map(str, words))}", err=True)
 
 
 def own_step(ctx: click.Context, *words: str | Path) -> None:

@@ -44,8 +44,8 @@ from ambiguous_wild.io.scene_folder import load_scene, read_scene_json, without_
 
 FILES = ("scene", "archive", "path", "role", "split", "sha256", "bytes")
 PHOTOS = ("scene", "photo", "split", "source", "done", "metadata_removed", "person")
-FIXED = ("README.md", "croissant.json", "files.csv", "photos.csv", "checksums.sha256", "checksums.md5")
-CARDS = ("README.md", "croissant.json")  # a person may have edited them
+EDITABLE = ("README.md", "croissant.json", "files.csv", "photos.csv")  # a person may have edited them
+FIXED = (*EDITABLE, "checksums.sha256", "checksums.md5")
 _TIME = (1980, 1, 1, 0, 0, 0)  # the earliest time that zip can hold
 NOT_STATED = "not stated"  # the licence in scene.json
 _DROPPED = ("seconds", "capture")  # keys of scene.json that differ between two builds of one scene
@@ -77,7 +77,7 @@ def package_scenes(
 
     Args:
         scenes: scene folders with scene.json.
-        output: the folder to make; an earlier package in it is replaced.
+        output: the folder to make; an earlier package in it is replaced, unless a person edited its texts.
         info: licence, consent and the rest; of simulated scenes they are known.
         keep_metadata: leave EXIF with places and serial numbers in the photos.
         look_for_people: run the person detectors of `privacy`.
@@ -99,10 +99,13 @@ def package_scenes(
     lines = sums.read_text(encoding="utf-8", errors="replace").splitlines() if sums.is_file() else []
     listed = {line[66:]: line[:64] for line in lines}
     check_replaceable(output, "package", {*FIXED, *listed} if "croissant.json" in listed else None)
-    for name in CARDS:
+    for name in EDITABLE:
         path = output / name
-        if name in listed and path.is_file() and sha256_file(path) != listed[name]:
-            raise AwError(f"{path} was edited and would be replaced: move it, or choose another -o")
+        if path.is_file() and sha256_file(path) != listed.get(name):
+            raise AwError(
+                f"{path} is not as this command wrote it and would be replaced: move it elsewhere, or "
+                "choose another -o"
+            )
     bar = Bar(progress)
     file_rows: list[list[Any]] = []
     photo_rows: list[list[Any]] = []
@@ -126,7 +129,7 @@ def package_scenes(
         write_json(folder / "croissant.json", data)
         (folder / "README.md").write_text(card(info, facts, people, stripped, keep_metadata), "utf-8")
         for kind in ("sha256", "md5"):
-            every = [*packed, *(_described(folder / n, "") for n in CARDS)]
+            every = [*packed, *(_described(folder / n, "") for n in EDITABLE[:2])]
             text = "".join(f"{getattr(f, kind)}  {f.name}\n" for f in sorted(every, key=lambda f: f.name))
             (folder / f"checksums.{kind}").write_text(text, encoding="utf-8")
     bar.finish()

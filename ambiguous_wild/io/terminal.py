@@ -9,7 +9,7 @@ import threading
 import time
 import unicodedata
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -80,15 +80,12 @@ def say(text: str, *, out: bool = False, fg: str = "", only: str = "") -> None:
     line = wrapped(plain(text), line_width(not out))
     if fg:
         line = line.replace(only, click.style(only, fg=fg), 1) if only else click.style(line, fg=fg)
-    bars = getattr(
-        sys.modules.get("tqdm"), "tqdm", None
-    )  # a bar on the line is cleared, and drawn again below
-    with bars.external_write_mode() if bars is not None else nullcontext():
-        try:
-            click.echo(line, err=not out)
-        except BrokenPipeError:  # nobody reads how a command goes on (`aw bench 2>&1 | head`): it goes on
-            if out:
-                raise
+    bars = getattr(sys.modules.get("tqdm"), "tqdm", None)
+    # a bar on the line is cleared, and drawn again below
+    cleared = nullcontext() if bars is None else bars.external_write_mode()
+    # if nobody reads how a command goes on (`aw bench 2>&1 | head`), it goes on
+    with nullcontext() if out else suppress(BrokenPipeError), cleared:
+        click.echo(line, err=not out)
 
 
 def keep_clock_running(bar: tqdm[Any]) -> None:

@@ -271,7 +271,7 @@ def _run(folder: Path, result: RunResult) -> CostRun:
         "images": sorted(images),
     }
     points, damage = _points(folder / "timeline.csv", train_s, psnr)
-    no_probes = f"no probes in {folder / 'timeline.csv'}" if len(points) < 2 else ""
+    no_probes = f"too few probes in {folder / 'timeline.csv'}" if len(points) < 2 else ""
     return CostRun(
         folder=folder,
         method=result["method"],

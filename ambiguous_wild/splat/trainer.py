@@ -78,7 +78,6 @@ class Trainer:
         self.run_identity: dict[str, str] = {}
         self.continues: frozenset[str] = frozenset()  # hashes of shorter runs whose checkpoint may be resumed
         self.iteration = 0
-        self.opacity_reset = False  # whether the last step reset the opacities: renders are empty after it
         self.timeline = Timeline()
         self._skipped: set[int] = set()  # views that were fully masked at some step
         data = data.for_method()
@@ -388,8 +387,7 @@ class Trainer:
                 skip_step = self._watch(step, keep, method_cotangents, loss, gradients)
                 step, gradients = _for_statistics(step, gradients, skip_step)
         events = self._learn(step, keep, gradients, skip_step)
-        self.opacity_reset = "reset" in events
-        if self.opacity_reset:
+        if "reset" in events:
             self.hooks.mask.on_opacity_reset(step)
         if events or self.watchdog.due(iteration):
             with part("watchdog"):

@@ -106,7 +106,9 @@ def advance(trainer: Trainer, tick: Tick | None = None) -> None:
         passed = _marks(trainer)
     trainer.marks = passed
     if passed != before:
-        _add_row(trainer, probing=passed[0] > before[0] and not trainer.opacity_reset)
+        # right after an opacity reset the renders are nearly empty
+        reset = trainer.density.last_reset == trainer.iteration
+        _add_row(trainer, probing=passed[0] > before[0] and not reset)
     if tick is not None:
         tick(trainer)
     if meter is not None and calibrating:

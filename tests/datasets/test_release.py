@@ -236,7 +236,7 @@ def test_nothing_of_the_users_is_replaced(scene, package, tmp_path):
         (copy / name).unlink()
     card = (copy / "README.md").read_text(encoding="utf-8")
     (copy / "README.md").write_text(card + "Cite us.", encoding="utf-8")
-    with pytest.raises(AwError, match=r"README\.md was edited"):
+    with pytest.raises(AwError, match=r"README\.md is not as this command wrote it"):
         package_scenes([scene], copy, INFO, look_for_people=False)
     (copy / "README.md").write_text(card, encoding="utf-8")
     assert package_scenes([scene], copy, INFO, look_for_people=False).stripped == 2

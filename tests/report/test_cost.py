@@ -327,9 +327,9 @@ def test_errors_say_what_to_do(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("timeline", "reason"),
     [
-        ("wall_s,psnr_probe\n40,\n", "no probes in {}"),
+        ("wall_s,psnr_probe\n40,\n", "too few probes in {}"),
         ("x,y\n1,2\n", "{} is damaged (no column wall_s and psnr_probe)"),
-        (None, "no probes in {}"),
+        (None, "too few probes in {}"),
     ],
 )
 def test_no_mean_of_a_crossing_and_of_the_end_of_a_run(

@@ -26,7 +26,7 @@ class Empty(Trainer):
 
     gaussians = range(5)  # type: ignore[assignment]
     meter = marks = device_check = None  # type: ignore[assignment]
-    opacity_reset = False
+    density = SimpleNamespace(last_reset=0)  # type: ignore[assignment]
     step_s = 0.01
     between_s = 0.0  # pass after a step, before the clock is read again
 
@@ -127,6 +127,6 @@ def test_no_probe_falls_on_a_reset_of_opacities(scene, tmp_path):
     density = DensityConfig(resets=(15_000.0,), min_reset_rest=1, min_reset_spacing=1)
     parts = MethodHooks(density_config=density)
     run = trained(scene, tmp_path, parts=parts, probe=lambda draw: 20.0, iterations=40, probes=4)
-    assert run.field.density.last_reset == 20
+    assert run.density.last_reset == 20
     probed = [row["iteration"] for row in run.timeline.rows if row["psnr_probe"] is not None]
     assert probed == [10, 30, 40]

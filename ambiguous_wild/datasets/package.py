@@ -129,7 +129,7 @@ def package_scenes(
         write_json(folder / "croissant.json", data)
         (folder / "README.md").write_text(card(info, facts, people, stripped, keep_metadata), "utf-8")
         for kind in ("sha256", "md5"):
-            every = [*packed, *(_described(folder / n, "") for n in EDITABLE[:2])]
+            every = [*packed, *(_described(folder / n, "") for n in ("croissant.json", "README.md"))]
             text = "".join(f"{getattr(f, kind)}  {f.name}\n" for f in sorted(every, key=lambda f: f.name))
             (folder / f"checksums.{kind}").write_text(text, encoding="utf-8")
     bar.finish()

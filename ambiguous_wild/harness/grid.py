@@ -313,9 +313,9 @@ def expected_time_line(cells: Sequence[Cell]) -> str:
     runs = "1 run" if len(cells) == 1 else f"{len(cells)} runs"
     return (
         f"no --iterations and no --budget: {runs} of {cells[0].train.iterations} iterations take "
-        f"{_duration(MIN_RATIO * total)} to {_duration(MAX_RATIO * total)} with 3dgs on this machine, most "
-        "other methods up to 3 times as long, those with networks for appearance up to "
-        "12; --budget 10m ends each after ten minutes"
+        f"{_duration(MIN_RATIO * total)} to {_duration(MAX_RATIO * total)} with 3dgs on this machine, "
+        "most other methods up to 3 times as long, those with networks for appearance up to 12; --budget 10m "
+        "ends each after ten minutes"
     )
 
 

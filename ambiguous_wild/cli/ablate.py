@@ -103,13 +103,21 @@ def command(
 
     on = choose_device(device)
     train = TrainConfig(
-        iterations=iterations or TrainConfig.iterations,
+        iterations=TrainConfig.iterations if iterations is None else iterations,
         budget_s=None if budget is None else parse_budget(budget),
         max_gaussians=max_gaussians,
     )
     settings = tuple(text.removeprefix(f"{method}.") for text in settings)  # as `aw bench` wants them
     plan = functools.partial(
-        plan_study, method, scenes, seeds, train, settings=settings, device=on, factor=factor
+        plan_study,
+        method,
+        scenes,
+        seeds,
+        train,
+        settings=settings,
+        device=on,
+        factor=factor,
+        default_length=iterations is None and budget is None,
     )
     study = plan(groups=groups)
     before = earlier_groups(study, output)

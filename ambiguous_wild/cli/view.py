@@ -79,7 +79,7 @@ class HostPort(click.ParamType):
     help="Train on SCENE and watch it in a browser.",
 )
 @click.option("--method", default="refinesplat", show_default=True, help="With --live: method to train.")
-@click.option("--iterations", type=Count(1), help="With --live: iterations.  [default: 30000]")
+@click.option("--iterations", type=Count(1), help="With --live: iterations.  [default: as aw bench]")
 @seed_option("With --live: seed.")
 @threads_option
 @device_option("With --live: auto is the GPU if torch and gsplat can use one, else the CPU.")

@@ -100,6 +100,7 @@ def plan_study(
     settings: Sequence[str] = (),
     device: str = "cpu",
     factor: int | None = None,
+    default_length: bool = False,
 ) -> AblationStudy:
     """Plan every variant on every scene with every seed; nothing is trained.
 
@@ -115,6 +116,7 @@ def plan_study(
         settings: "key=value", replace defaults in every row, the default row included.
         device: "cpu" or "cuda".
         factor: N of the folder images_N; None = the one that the scene was built for.
+        default_length: replace `train.iterations` by each scene's default.
 
     Raises:
         AwError: unknown method, group, option in `settings` or scene.
@@ -124,7 +126,13 @@ def plan_study(
     chosen = choose_groups(method, every, groups)
     own = [f"{method}.{text}" for text in settings]
     plan = functools.partial(
-        plan_cells, scenes=scenes, seeds=seeds, train=train, device=device, factor=factor
+        plan_cells,
+        scenes=scenes,
+        seeds=seeds,
+        train=train,
+        device=device,
+        factor=factor,
+        default_length=default_length,
     )
     default = tuple(plan([method], settings=own))
     names = _Names(entry, default[0].options, every)

@@ -171,7 +171,7 @@ def bench(
         scenes: scene folders.
         output: folder of the runs: OUTPUT/[GROUP/]SCENE/METHOD/seed0.
         seeds: every method is trained once with each seed.
-        iterations: length of a training; None = 30000.
+        iterations: length of a training; None = 200 for each train photo of the scene, 7000 to 30 000.
         budgets_s: length in seconds of training instead; several = every length, each in its own group.
         effects: "none", "all", "auto" (the plan of the scene) or names with commas, for all methods alike;
             several = every choice, each in its own group.
@@ -249,7 +249,7 @@ def bench(
 
         used_device = session.device(device)
         config = TrainConfig(
-            iterations=iterations or TrainConfig.iterations,
+            iterations=TrainConfig.iterations if iterations is None else iterations,
             budget_s=budgets_s[0] if budgets_s else None,
             **(train or {}),
         )
@@ -267,6 +267,7 @@ def bench(
                 plan=read_plan(Path(plan)) if isinstance(plan, str | Path) else plan,
                 protocol=protocol,
                 start=None if start is None else Path(start),
+                default_length=iterations is None and not budgets_s,
             )
             for wanted in dict.fromkeys(choices)
         }

@@ -41,7 +41,7 @@ from ambiguous_wild.io.scene_folder import ALL_TRAINED, load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
 from ambiguous_wild.splat.effects import check_effects
 from ambiguous_wild.splat.method_hooks import MethodHooks
-from ambiguous_wild.splat.train_config import TrainConfig
+from ambiguous_wild.splat.train_config import TrainConfig, default_iterations
 
 
 def try_recipes(cells: Sequence[Cell]) -> list[str]:
@@ -101,6 +101,7 @@ def plan_cells(
     plan: EffectsPlan | None = None,
     protocol: Protocol | None = None,
     start: Path | None = None,
+    default_length: bool = False,
 ) -> list[Cell]:
     """Plan every method on every scene with every seed, after a check of all names and options.
 
@@ -116,6 +117,7 @@ def plan_cells(
         plan: plan of the only scene, if it was made before; None = made where one is needed.
         protocol: "full" measures whole test photos, "half" the right half; None = what scene.json says.
         start: a splat file or point cloud to start from; None = the scene's points.
+        default_length: replace `train.iterations` by each scene's default.
 
     Raises:
         AwError: unknown method, option or scene; a start that no camera sees; two scenes of the same name.
@@ -151,9 +153,10 @@ def plan_cells(
         identity = scene_identity(scene)
         chosen = choose_effects(effects, scene, list(named.values()), plan)
         measured = protocol or scene_protocol(scene)
+        iterations = default_iterations(len(scene.train)) if default_length else train.iterations
         for entry, options in resolved:
             for seed in dict.fromkeys(seeds):
-                config = dataclasses.replace(train, seed=seed)
+                config = dataclasses.replace(train, seed=seed, iterations=iterations)
                 cells.append(
                     Cell(entry, options, scene, identity, config, device, chosen[entry.name], measured, file)
                 )
@@ -311,8 +314,10 @@ def expected_time_line(cells: Sequence[Cell]) -> str:
         gaussians = min(cell.train.max_gaussians or pixels, pixels)
         total += expected_s(cell.train.iterations, pixels, gaussians) * slower
     runs = "1 run" if len(cells) == 1 else f"{len(cells)} runs"
+    lengths = sorted({cell.train.iterations for cell in cells})
+    length = " to ".join(str(n) for n in dict.fromkeys((lengths[0], lengths[-1])))
     return (
-        f"no --iterations and no --budget: {runs} of {cells[0].train.iterations} iterations take "
+        f"no --iterations and no --budget: {runs} of {length} iterations take "
         f"{_duration(MIN_RATIO * total)} to {_duration(MAX_RATIO * total)} with 3dgs on this machine, "
         "most other methods up to 3 times as long, those with networks for appearance up to 12; --budget 10m "
         "ends each after ten minutes"

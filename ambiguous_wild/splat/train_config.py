@@ -8,7 +8,16 @@ from typing import Literal
 from ambiguous_wild.core import AwError
 
 NOMINAL_ITERATIONS = 30_000  # schedules are written for this length and scale with that of the run
+PER_PHOTO, SHORTEST = 200, 7000  # default length: iterations per train photo, and at least
 OnNonFinite = Literal["stop", "rollback"]
+
+
+def default_iterations(photos: int) -> int:
+    """Return the default length of a run on a scene with this number of train photos.
+
+    Few photos are overfitted by as many iterations as hundreds need (docs/training.md).
+    """
+    return min(max(PER_PHOTO * photos, SHORTEST), NOMINAL_ITERATIONS)
 
 
 @dataclass(frozen=True)

@@ -92,6 +92,11 @@ def test_every_scene_and_seed_has_its_own_folder(scene, tmp_path):
     assert len({cell.identity for cell in cells}) == 6
 
 
+def test_without_a_length_every_row_has_the_default_of_the_scene(scene):
+    for given, iterations in ({}, SHORT.iterations), ({"default_length": True}, 7000):
+        assert {cell.train.iterations for cell in study(scene, **given).cells} == {iterations}
+
+
 def test_runs_of_a_study_are_those_of_aw_table_and_are_kept(scene, tmp_path):
     plan = study(scene)
     assert {r.outcome for r in run_cells(plan.cells, tmp_path)} == {"trained"}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +17,6 @@ from ambiguous_wild.cli.options import (
     label_option,
     only_option,
 )
-from ambiguous_wild.core.errors import AwError
 from ambiguous_wild.io.terminal import line_width, say
 
 if TYPE_CHECKING:
@@ -67,8 +65,6 @@ def command(
     aw cost runs --target 25 -o cost
     aw cost runs --recommend my-scene 5m
     """
-    if any(not math.isfinite(t) for t in targets):
-        raise AwError("--target must be a number of dB, e.g. 25")
     from ambiguous_wild.io.files import check_output
     from ambiguous_wild.report.cost_report import cost_report, plain_data, to_text, write_report
     from ambiguous_wild.report.cost_runs import read_cost_runs

@@ -145,7 +145,6 @@ def publish_command(
     board: Path,
     output: Path,
     models: tuple[Path, ...],
-    reported: Path | bool | None,
     as_json: bool,
     **options: Any,  # the other arguments of `publish`, by their names
 ) -> None:
@@ -159,15 +158,13 @@ def publish_command(
     done = publish(
         board,
         output,
-        reported=reported is not None,
-        reported_from=reported if isinstance(reported, Path) else None,
         models=models,
         say=say,
         **options,
     )
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(done), indent=2))
-    summary = f"{done.runs} runs of {done.datasets} datasets, {done.images} pictures"
+    summary = f"{counted(done.runs, 'run')} of {counted(done.datasets, 'dataset')}, {counted(done.images, 'picture')}"
     if models:
         summary += f", {done.model_pages} pages with models"
     if done.reported_from is not None:
@@ -192,6 +189,6 @@ def check_command(board: Path, as_json: bool) -> None:
     else:
         for problem in result.problems:
             say(f"wrong: {problem}", out=True, fg="red")
-    say(f"{result.runs} runs: {len(result.problems)} problems; board {board}")
+    say(f"{counted(result.runs, 'run')}: {counted(len(result.problems), 'problem')}; board {board}")
     if result.problems:
         sys.exit(AwError.exit_code)

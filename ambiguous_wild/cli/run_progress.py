@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ambiguous_wild.core.errors import AwError
+from ambiguous_wild.core.errors import AwError, counted
 from ambiguous_wild.harness.callbacks import Lines, outcome_line, run_name
 from ambiguous_wild.io.terminal import keep_clock_running, say
 
@@ -168,6 +168,6 @@ def finish(report: BenchReport, as_json: bool, *, tabulated: bool = False) -> No
         one = shlex.quote(str(folders[0] / scenes[0])) if len(scenes) > 1 else output
         compare += f", look at them{' scene by scene' * (len(scenes) > 1)} with: aw view {one}"
     summary = ", ".join(f"{n} {outcome}" for outcome, n in report.outcomes.items())
-    say(f"{count} run{'s' if count > 1 else ''}: {summary}; {compare}")
+    say(f"{counted(count, 'run')}: {summary}; {compare}")
     if failed:
         raise AwError(f"{len(failed)} of {count} runs failed: " + failed[0].error)

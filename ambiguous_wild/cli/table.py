@@ -112,8 +112,8 @@ def table_command(
             )
         _write_tidy(_read(runs, labels), output, metrics, scenes)
         return
-    if compare is not None and layout != "blocks":
-        raise AwError(f"--compare does not go with --layout {layout}: it is a table of its own")
+    if compare is not None and (layout != "blocks" or datasets or reported):
+        raise AwError("--compare is a table of its own: leave --layout, --dataset and --reported out")
     if layout in ("blocks", "ablation"):
         refused = {"--dataset": datasets, "--reported": reported}
         if layout == "ablation":
@@ -122,7 +122,8 @@ def table_command(
             refused |= {"--only": scenes, "--label": labels}
         for flag, value in refused.items():
             if value:
-                raise AwError(f"{flag} does not go with --layout {layout}: give --layout paper or means")
+                instead = "leave it out" if layout == "ablation" else "give --layout paper or means"
+                raise AwError(f"{flag} does not go with --layout {layout}: {instead}")
     loaded = None if layout == "ablation" else _read(runs, labels)
     named_style = None if style == "text" else style
     made_by = "command: " + command_line(style=named_style, output=None, metrics=metrics)
@@ -356,6 +357,8 @@ def audit_command(tables: tuple[Path, ...], output: Path | None, strict: bool, a
     else:
         click.echo(text, nl=style == "text" and bool(findings))
     count = len({n.table for n in numbers})
-    say(f"{len(findings)} findings in {len(numbers)} numbers of {count} tables")
+    say(
+        f"{counted(len(findings), 'finding')} in {counted(len(numbers), 'number')} of {counted(count, 'table')}"
+    )
     if strict and findings:
         sys.exit(1)

@@ -60,8 +60,8 @@ class HostPort(click.ParamType):
 @click.command(name="view")
 @click.argument("runs", nargs=-1, type=PathName())
 @click.option(
-    "-o", "--output", type=PathName(file_okay=False), default=Path("view"), show_default=True,
-    help="Folder of the page; with --live, of the run (default then: runs).",
+    "-o", "--output", type=PathName(file_okay=False),
+    help="Folder of the page; with --live, of the run.  [default: view; with --live, runs]",
 )  # fmt: skip
 @scene_folder_option
 @label_option
@@ -87,11 +87,9 @@ class HostPort(click.ParamType):
     "--port", type=HostPort(), default="8080", show_default=True,
     help=f"With --live: where to listen. HOST is {THIS_MACHINE} (this machine alone), PORT 0 any free one.",
 )  # fmt: skip
-@click.pass_context
 def view_command(
-    ctx: click.Context,
     runs: tuple[Path, ...],
-    output: Path,
+    output: Path | None,
     scene_folder: Path | None,
     labels: tuple[str, ...],
     max_gaussians: int | None,
@@ -113,17 +111,15 @@ def view_command(
     aw view --live scene --method 3dgs         watch a training at http://127.0.0.1:8080
     """
 
-    chosen = ctx.get_parameter_source("output")
     if live is not None:
         if runs:
             raise AwError("--live trains a run of its own: leave RUNS out, or leave --live out")
         from ambiguous_wild.report.model_views import watch
 
-        folder = Path("runs") if chosen is click.core.ParameterSource.DEFAULT else output
         watch(
             live,
             method,
-            folder,
+            output or Path("runs"),
             max_gaussians=max_gaussians,
             host=port[0],
             port=port[1],
@@ -137,7 +133,7 @@ def view_command(
 
     page = view_runs(
         runs,
-        output,
+        output or Path("view"),
         scene_folder=scene_folder,
         most_gaussians=max_gaussians or MAX_GAUSSIANS,
         title=title,

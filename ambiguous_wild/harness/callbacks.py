@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -48,8 +49,11 @@ class Engine:
         if self.engine == "ray":
             if importlib.util.find_spec("ray") is None:
                 raise AwError(f"--engine ray needs Ray: {install_command('ray')}")
-            if self.jobs is not None and self.address is not None:
-                raise AwError("--jobs is for this machine: a cluster at --address runs as many cells as fit")
+            if self.jobs is not None and self.remote:
+                raise AwError(
+                    "--jobs is for this machine: a cluster (--address or $RAY_ADDRESS) runs as many cells as "
+                    "fit"
+                )
 
     @property
     def remote(self) -> bool:
@@ -112,16 +116,12 @@ def outcome_line(report: CellReport) -> str:
         return "failed: " + " ".join(report.error.split())
     if report.result is None:
         return "trained"
-    from ambiguous_wild.harness.result_file import NOT_BEGUN
+    from ambiguous_wild.harness.result_file import NOT_BEGUN, mean_of
     from ambiguous_wild.harness.timing import timing_of
 
     cost = report.result["cost"]
-    values = [float(v) for row in report.result["per_image"] if (v := row.get("psnr")) is not None]
-    parts = (
-        [f"PSNR {sum(values) / len(values):.2f} dB over {counted(len(values), 'test view')}"]
-        if values
-        else []
-    )
+    psnr, views = mean_of(report.result, "psnr"), counted(len(report.result["per_image"]), "test view")
+    parts = [f"PSNR {psnr:.2f} dB over {views}"] if math.isfinite(psnr) else []
     # an external program may not report all of these
     if (train_s := cost.get("train_s")) is not None:
         parts.append(f"{train_s:.0f} s training")

@@ -10,7 +10,7 @@ from typing import Any
 
 from ambiguous_wild.core import Scene
 from ambiguous_wild.core.config import with_options
-from ambiguous_wild.core.errors import AwError, unknown
+from ambiguous_wild.core.errors import AwError, counted, unknown
 from ambiguous_wild.harness.callbacks import Callbacks
 from ambiguous_wild.harness.cell import (
     Cell,
@@ -313,11 +313,10 @@ def expected_time_line(cells: Sequence[Cell]) -> str:
         pixels = camera.width * camera.height
         gaussians = min(cell.train.max_gaussians or pixels, pixels)
         total += expected_s(cell.train.iterations, pixels, gaussians) * slower
-    runs = "1 run" if len(cells) == 1 else f"{len(cells)} runs"
     lengths = sorted({cell.train.iterations for cell in cells})
     length = " to ".join(str(n) for n in dict.fromkeys((lengths[0], lengths[-1])))
     return (
-        f"no --iterations and no --budget: {runs} of {length} iterations take "
+        f"no --iterations and no --budget: {counted(len(cells), 'run')} of {length} iterations take "
         f"{_duration(MIN_RATIO * total)} to {_duration(MAX_RATIO * total)} with 3dgs on this machine, "
         "most other methods up to 3 times as long, those with networks for appearance up to 12; --budget 10m "
         "ends each after ten minutes"
@@ -356,11 +355,8 @@ def choose_effects(
             f"the plan is of another state of scene {scene.name} (its files, its split, or the size of its "
             f"photos have changed): run {again}"
         )
-    if wanted != "auto":
-        asked = ChosenEffects(named, "" if wanted == "none" else wanted)
-        return {m.name: asked if takes_effects(m) else ChosenEffects() for m in methods}
-    if not any(map(takes_effects, methods)):
-        return {m.name: ChosenEffects() for m in methods}
-    plan = plan_effects(scene) if plan is None else plan
-    auto = ChosenEffects(check_effects([*plan.effects(), *published_effects(scene)]), "auto", plan)
-    return {m.name: auto if takes_effects(m) else ChosenEffects() for m in methods}
+    chosen = ChosenEffects(named, "" if wanted == "none" else wanted)
+    if wanted == "auto" and any(map(takes_effects, methods)):
+        plan = plan_effects(scene) if plan is None else plan
+        chosen = ChosenEffects(check_effects([*plan.effects(), *published_effects(scene)]), "auto", plan)
+    return {m.name: chosen if takes_effects(m) else ChosenEffects() for m in methods}

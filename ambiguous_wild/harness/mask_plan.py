@@ -65,6 +65,7 @@ HELD_OUT_SHARE = 0.2  # share of a photo's blocks that is left out
 BLOCKS = 8  # number along a photo's longest side
 MEASURED_FROM = 0.5  # share of a probe after which visits measure
 FIXED = DensityConfig(start=1e9, stop=0.0)
+Bar = Callable[..., AbstractContextManager[Any]]
 NO_BAR: Bar = functools.partial(tqdm, disable=True)
 
 
@@ -80,7 +81,7 @@ class Occlusion:
 
 
 def small_data(scene: Scene, folder: Path) -> TrainData:
-    """Load the training data with photos of at most LONGEST px."""
+    """Load the training data with photos of at most MAX_SIDE px."""
     data = load_train_data(scene, device=torch.device("cpu"), seed=0, cache_dir=folder)
     photos, cameras, keeps = [], [], []
     for photo, camera, keep in zip(data.photos, data.cameras, data.user_keep):
@@ -194,7 +195,7 @@ def measure_occlusion(
     scene: Scene,
     effects: tuple[str, ...] = (),
     *,
-    bar: Callable[..., AbstractContextManager[Any]],
+    bar: Bar,
 ) -> Occlusion:
     """Train a probe of `ITERATIONS`; where its residual mask is large, one of `LONG_ITERATIONS` counts.
 
@@ -329,9 +330,6 @@ class MaskComparison:
         train(trainer, tick=lambda _: tick())
         names = [view.name for view in self.data.scene.train]
         return {names[view]: float(np.mean(dbs)) for view, dbs in sorted(policy.visits.items())}
-
-
-Bar = Callable[..., AbstractContextManager[Any]]
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,14 @@ def own_s() -> float:
 
 def hardware_name(device: str) -> str:
     """Return a name for the hardware that runs on this device share: the processors, or a GPU's identity."""
-    return _gpu_name(device) if device.startswith("cuda") else "cpu"
+    if not device.startswith("cuda"):
+        return "cpu"
+    index = torch.device(device).index or 0
+    try:
+        name = getattr(torch.cuda.get_device_properties(index), "uuid", None)
+    except (RuntimeError, AssertionError):  # a torch without CUDA
+        name = None
+    return f"GPU-{name}" if name is not None else str(index)
 
 
 class ActiveRuns:
@@ -122,17 +129,6 @@ def _is_held(path: Path) -> bool:
         path.unlink(missing_ok=True)
         lock.release()
     return False
-
-
-def _gpu_name(device: str) -> str:
-    import torch
-
-    index = torch.device(device).index or 0
-    try:
-        name = getattr(torch.cuda.get_device_properties(index), "uuid", None)
-    except (RuntimeError, AssertionError):  # a torch without CUDA
-        name = None
-    return f"GPU-{name}" if name is not None else str(index)
 
 
 def _own_folder() -> Path:

@@ -241,7 +241,7 @@ def _no_run(root: Path) -> AwError:
     """Return the error for a folder without runs; it says what the folder holds, where that is clear."""
     named = shlex.quote(str(root))
     within = [root, *(child for child in root.iterdir() if child.is_dir())]
-    if (root / "scene.json").exists():
+    if (root / "scene.json").exists() or (root / "sparse").is_dir():
         return AwError(
             f"{root} is a scene, not runs: 'aw bench --method NAME --scene {named} -o runs' makes some"
         )

@@ -14,7 +14,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Scene
 from ambiguous_wild.core.config import from_plain
-from ambiguous_wild.core.errors import shortlist, similar_path
+from ambiguous_wild.core.errors import shortlist
 from ambiguous_wild.harness.cell import scene_identity
 from ambiguous_wild.harness.chosen_effects import mixed_tests
 from ambiguous_wild.harness.labels import shown_names
@@ -29,7 +29,7 @@ from ambiguous_wild.harness.result_file import (
     metrics_of,
     read_result,
 )
-from ambiguous_wild.harness.store import ReadConfig, config_section, read_config, run_folders
+from ambiguous_wild.harness.store import ReadConfig, config_section, find_runs, read_config
 from ambiguous_wild.io.files import write_text
 from ambiguous_wild.io.mask_reasons import FILE as REASONS
 from ambiguous_wild.io.ply import splat_count
@@ -135,33 +135,20 @@ def find_run_models(
     same method by seed, then by folder.
 
     Raises:
-        AwError: no such folder, or no run with a model in any of them.
+        AwError: no such folder, one without a run, or no run with a model in any of them.
     """
     trained: list[TrainedModel] = []
     notes: list[str] = []
-    for root in paths:
-        if not root.is_dir():
-            raise AwError(
-                f"no folder of runs {root}: give the folder that 'aw bench -o' wrote, a run in it, or a "
-                f"splat file{similar_path(root)}"
-            )
-        for run in dict.fromkeys(run_folders(root)):
-            if any(t.run.samefile(run) for t in trained):
-                continue
-            try:
-                trained.append(_read_model(run))
-            except AwError as error:
-                notes.append(f"not shown: {error}")
-                continue
-            if trained[-1].note:
-                notes.append(trained[-1].note)
+    for run in find_runs(paths):
+        try:
+            trained.append(_read_model(run))
+        except AwError as error:
+            notes.append(f"not shown: {error}")
+            continue
+        if trained[-1].note:
+            notes.append(trained[-1].note)
     if not trained:
-        why = f" ({notes[0]})" if notes else ""
-        scenes = (path for path in paths for part in ("scene.json", "sparse") if (path / part).exists())
-        if scene := next(scenes, None):
-            train = f"'aw bench --method NAME --scene {shlex.quote(str(scene))} -o runs'"
-            why = f": {scene} is a scene, which {train} trains"
-        raise AwError(f"no finished run with a {MODEL} below {shortlist(map(str, paths))}{why}")
+        raise AwError(f"no finished run with a {MODEL} below {shortlist(map(str, paths))} ({notes[0]})")
     if labels:
         shown = shown_names(labels, [t.model.label for t in trained])
         trained.sort(key=lambda t: list(shown).index(t.model.label))

@@ -271,8 +271,7 @@ def publish(
     board: Path,
     out: Path,
     *,
-    reported: bool = False,
-    reported_from: Path | None = None,
+    reported: Path | bool | None = None,
     title: str = "Leaderboard",
     models: Sequence[Path] = (),
     labels: Sequence[str] = (),
@@ -283,8 +282,8 @@ def publish(
     Args:
         board: folder of the leaderboard.
         out: folder for index.html, data/*.csv and images/.
-        reported: also show numbers that papers print: BOARD/reported/*.csv, else the tables of this package.
-        reported_from: also show numbers that papers print, from this folder.
+        reported: also show numbers that papers print, from this folder; True = BOARD/reported, else the
+            tables of this package.
         title: title of the page.
         models: run folders, or folders of them; their models are shown on OUT/models/*.html, as by `aw view`.
         labels: names of methods on the page, see `labels.shown_names`; CSV files and commands keep theirs.
@@ -295,12 +294,10 @@ def publish(
     """
     if not board.is_dir():
         raise AwError(f"no leaderboard {board}: 'aw leaderboard add RUNS --board {board}' makes one")
-    if reported_from is not None and not reported_from.is_dir():
-        raise AwError(
-            f"no folder of reported numbers {reported_from}: give one with *.csv, see docs/tables.md"
-        )
-    source = reported_from
-    if reported and source is None:
+    source = reported if isinstance(reported, Path) else None
+    if source is not None and not source.is_dir():
+        raise AwError(f"no folder of reported numbers {source}: give one with *.csv, see docs/tables.md")
+    if reported is True:
         source = board / SOURCE if (board / SOURCE).is_dir() else REPORTED
     check_output(out)
     out = Path(os.path.realpath(out))

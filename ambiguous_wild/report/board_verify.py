@@ -174,21 +174,15 @@ def _config(run: Path) -> RunConfig:
 
 def _words(run: Path, config: RunConfig, before: list[str], recorded: str) -> tuple[str, str]:
     """Return (setting, commands) of a configuration, which a stranger may have written."""
-    by_plan = _by_plan(run, config)
+    if config.get("effects") and not (run / EFFECTS).is_file():
+        _partial(run, f"it lacks {EFFECTS}, which says who chose its effects")
     try:
-        words = check_text(f"setting of {run}", setting(config, by_plan))
+        words = check_text(f"setting of {run}", setting(config, chosen_by_plan(run)))
         return words, command(config, before, recorded)
     except AwError as error:
         raise AwError(f"{run}: {error}") from None
     except (TypeError, ValueError, AttributeError, KeyError) as error:
         raise AwError(f"{run / 'config.yaml'} was not written by 'aw bench' ({error}): {RESTORE}") from None
-
-
-def _by_plan(run: Path, config: RunConfig) -> bool:
-    """Return whether the plan of the scene chose the run's effects."""
-    if config.get("effects") and not (run / EFFECTS).is_file():
-        _partial(run, f"it lacks {EFFECTS}, which says who chose its effects")
-    return chosen_by_plan(run)
 
 
 def chosen_by_plan(run: Path) -> bool:

@@ -228,16 +228,26 @@ def in_words(recommendation: Recommendation, scene: str) -> str:
     lines = [
         f"for {recommendation.scene} within {machine}: {best.name}",
         f"  {recommendation.command(scene)}",
-        f"  PSNR {best.psnr:.2f} dB ({where}), {best.ms_per_iteration:.1f} ms/iteration, "
-        f"{best.gaussians:,.0f} Gaussians, {best.model_mb:.1f} MB, set-up {best.setup_s:.1f} s",
+        _known(
+            f"  PSNR {best.psnr:.2f} dB ({where})",
+            (best.ms_per_iteration, "{:.1f} ms/iteration"),
+            *_size(best),
+            (best.setup_s, "set-up {:.1f} s"),
+        ),
     ]
     for other in recommendation.choices[1:]:
         close = " (within the noise of a scene)" if other.behind < CLOSE_DB else ""
-        lines.append(
-            f"  {other.name}: {other.behind:.2f} dB less{close}, {other.gaussians:,.0f} Gaussians, "
-            f"{other.model_mb:.1f} MB"
-        )
+        lines.append(_known(f"  {other.name}: {other.behind:.2f} dB less{close}", *_size(other)))
     return "\n".join([*lines, *recommendation.notes]) + "\n"
+
+
+def _size(choice: Choice) -> tuple[tuple[float, str], ...]:
+    return (choice.gaussians, "{:,.0f} Gaussians"), (choice.model_mb, "{:.1f} MB")
+
+
+def _known(first: str, *more: tuple[float, str]) -> str:
+    """Return the values in their formats; an external program may not report all of them."""
+    return ", ".join([first, *(form.format(value) for value, form in more if math.isfinite(value))])
 
 
 def speed_here(cost_runs: CostRuns) -> float:

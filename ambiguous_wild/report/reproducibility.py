@@ -212,6 +212,8 @@ def _why_not(run: _Run) -> str:
     """Return why a run does not repeat bit for bit, of "they ..."; empty if it does."""
     train = config_section(dict(run.config), "train") if run.config else {}
     if not train:
+        return "have no record of their settings"
+    if run.result["facts"].get("no_effects"):
         return "are of another program"
     if not str(run.result["cost"].get("device", "")).startswith("cpu"):
         return "were trained on a GPU"

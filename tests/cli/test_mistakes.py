@@ -71,7 +71,7 @@ MISTAKES = [
     ("try rwa -o out", "'rwa' does not exist; did you mean raw?"),
     ("table run", "no folder of runs run ... did you mean runs?"),
     ("view run", "no folder of runs run ... did you mean runs?"),
-    ("view above/scene", "above/scene is a scene, which 'aw bench"),
+    ("view above/scene", "above/scene is a scene, not runs: 'aw bench"),
     ("capture rwa -o out", "did you mean raw?"),
     ("import rwa -o out", "did you mean ... /raw?"),
     ("build-scene rwa -o out", "capture rwa does not exist; did you mean raw?"),

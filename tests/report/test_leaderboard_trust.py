@@ -350,4 +350,4 @@ def test_publish_says_where_it_looked_for_reported_numbers(board: Path, tmp_path
     (papers / "a.csv").write_text(text)
     assert f"1 reported numbers from {papers}" in told("--reported", papers)
     with pytest.raises(AwError, match="no folder"):
-        publish(board, tmp_path / "site", reported_from=tmp_path / "absent")
+        publish(board, tmp_path / "site", reported=tmp_path / "absent")

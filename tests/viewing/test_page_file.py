@@ -162,9 +162,10 @@ def test_what_covers_most_of_the_photos_stays(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_shown_is_one_line(runs: Path, tmp_path: Path) -> None:
+    (empty := tmp_path / "empty").mkdir()
     for words, told in (
         ([tmp_path / "none"], "no folder of runs"),
-        ([tmp_path], "no finished run with a point_cloud.ply"),
+        ([empty], "no run in"),
         ([runs, "--scene", tmp_path / "gone"], "take its folder: --scene"),
         ([], "no RUNS"),
         ([runs, "--live", runs.parent / "porch"], "leave RUNS out"),

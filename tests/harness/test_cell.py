@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import shlex
 import shutil
 import sys
@@ -69,6 +70,9 @@ def test_a_result_says_why_there_are_no_masks_to_compare(tmp_path):
     assert "no_masks" not in masking.result(error="lost")["facts"]
     report = CellReport(tmp_path, "trained", result=masking.result())
     assert f"{late}, a run too short" in outcome_line(report)
+    same = {"image": "a.png", "psnr": math.inf}, {"image": "b.png", "psnr": 20.0}
+    line = outcome_line(replace(report, result=masking.result() | {"per_image": same}))
+    assert line.startswith("PSNR 20.00 dB over 2 test views")  # as in tables: the mean of finite values
     for path in (scene / "truth/distractor").iterdir():
         write_png(path, read_gray(path)[::2, ::2])
     assert "not of the photos' size" in masking.result()["facts"]["no_masks"]

@@ -257,6 +257,13 @@ def test_what_does_not_go_together_is_refused(scene, tmp_path, words, message):
     assert not (tmp_path / "runs").exists()
 
 
+def test_jobs_do_not_go_with_a_cluster_that_the_environment_names(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: True)
+    monkeypatch.setenv("RAY_ADDRESS", "auto")
+    done = aw_bench(tmp_path / "runs", scene, "3dgs", "--engine", "ray", "--jobs", "2")
+    assert done.exit_code != 0 and "--jobs is for this machine" in done.output + str(done.exception)
+
+
 def test_without_ray_the_command_that_brings_it_is_said(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     done = aw_bench(tmp_path / "runs", scene, "3dgs", "--engine", "ray")

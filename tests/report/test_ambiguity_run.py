@@ -129,6 +129,9 @@ def test_runs_that_do_not_fit_are_refused(scene: Path, run: Path, tmp_path: Path
     for name in TRAIN:  # with a truth the run is not even read, and is still the wrong one
         (scene / "truth/clean" / name).write_bytes((scene / "images" / name).read_bytes())
     assert "'yard'" in error()
+    (run / "failed.json").write_text("{}")
+    assert "no finished run" in error()
+    (run / "failed.json").unlink()
     (run / "config.yaml").write_text("scene: [")
     assert "damaged" in error()
     (run / "point_cloud.ply").unlink()

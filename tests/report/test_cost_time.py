@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +117,9 @@ def test_the_setting_that_is_best_within_the_budget_is_recommended(tmp_path: Pat
     assert recommend(runs, "new", 60.0, speed=0.5).choices[0].name == short.choices[0].name
     text = in_words(long, "my scene")
     assert "for new within 5 min on this machine: good" in text and "3.00 dB less" in text
+    unknown = replace(long.choices[0], ms_per_iteration=math.nan, gaussians=math.nan)
+    text = in_words(replace(long, choices=(unknown,)), "s")
+    assert "nan" not in text and "MB, set-up" in text  # an external program reports no more
     assert "within 60 s on this machine (30 s of the reference machine)" in in_words(
         recommend(runs, "new", 60.0, speed=0.5), "s"
     )

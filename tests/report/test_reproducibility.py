@@ -101,6 +101,8 @@ def test_where_runs_differ_it_says_which_have_what(runs) -> None:
     assert "70 iterations for 3dgs and absgs; 60 s for gs-w" in text
     assert "3dgs and absgs repeat bit for bit; gs-w do not, as they end by the clock" in text
     assert len(said.commands) == 2 and "--budget 60s" in said.commands[1]
+    other = statement([runs("mip-splatting", facts={"no_effects": "an external program"})])
+    assert "as they end by the clock or are of another program" in " ".join(other.sentences)
 
 
 def test_runs_that_went_on_with_corrections_do_not_repeat(runs) -> None:

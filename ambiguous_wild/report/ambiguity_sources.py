@@ -11,7 +11,7 @@ import numpy as np
 
 from ambiguous_wild.core import AwError, Camera, Scene, View
 from ambiguous_wild.core.errors import shortlist
-from ambiguous_wild.harness.result_file import FAILED, MODEL
+from ambiguous_wild.harness.result_file import FAILED, MODEL, RESULT
 from ambiguous_wild.io import plain_yaml
 from ambiguous_wild.io.images import load_image_float, read_mask
 from ambiguous_wild.io.ply import read_splat_ply
@@ -239,8 +239,8 @@ def check_run(scene: Scene, run: Path) -> None:
     """
     from ambiguous_wild.harness.cell import scene_identity
 
-    path = run / "config.yaml"
-    if not path.is_file() or not (run / MODEL).is_file() or (run / FAILED).is_file():
+    path, failed = run / "config.yaml", (run / FAILED).is_file() and not (run / RESULT).is_file()
+    if failed or not path.is_file() or not (run / MODEL).is_file():
         raise AwError(
             f"{run} is no finished run (config.yaml and point_cloud.ply); give a folder of 'aw bench', "
             "RUNS/SCENE/METHOD/seed0"

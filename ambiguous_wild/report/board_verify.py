@@ -176,8 +176,9 @@ def _words(run: Path, config: RunConfig, before: list[str], recorded: str) -> tu
     """Return (setting, commands) of a configuration, which a stranger may have written."""
     if config.get("effects") and not (run / EFFECTS).is_file():
         _partial(run, f"it lacks {EFFECTS}, which says who chose its effects")
+    by_plan = chosen_by_plan(run)
     try:
-        words = check_text(f"setting of {run}", setting(config, chosen_by_plan(run)))
+        words = check_text(f"setting of {run}", setting(config, by_plan))
         return words, command(config, before, recorded)
     except AwError as error:
         raise AwError(f"{run}: {error}") from None

@@ -83,7 +83,7 @@ def _doubts(masks: str, colour: Summary, semantic: Summary) -> list[str]:
 
 def doubts(summary: Summary) -> str:
     """Return what to write behind the class: why it may be wrong, in brackets, or nothing."""
-    found = summary["doubts"]
+    found = summary.get("doubts")  # absent from older reports
     return f" (uncertain: {'; '.join(found)})" if found else ""
 
 
@@ -192,8 +192,8 @@ def describe(summary: Summary) -> list[str]:
             f"with {summary['features']}, a static region scores {look['same_surface']:.2f} against other "
             f"photos of itself and {look['unrelated']:.2f} against unrelated ones; {look['note']}"
         )
-    counts = summary["told"]
-    if counts["distractors"]:
+    counts: EvidenceCounts | None = summary.get("told")  # absent from older reports
+    if counts and counts["distractors"]:
         lines.append(_evidence_line(counts))
     if colour["unknown_px"]:
         share = 100 * colour["unknown_px"] / colour["distractor_px"]

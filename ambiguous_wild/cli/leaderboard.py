@@ -164,7 +164,8 @@ def publish_command(
     )
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(done), indent=2))
-    summary = f"{counted(done.runs, 'run')} of {counted(done.datasets, 'dataset')}, {counted(done.images, 'picture')}"
+    summary = f"{counted(done.runs, 'run')} of {counted(done.datasets, 'dataset')}"
+    summary += f", {counted(done.images, 'picture')}"
     if models:
         summary += f", {done.model_pages} pages with models"
     if done.reported_from is not None:

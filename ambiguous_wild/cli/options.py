@@ -215,7 +215,7 @@ training_options = _all(
     click.option(
         "--iterations",
         type=Count(1),
-        help="Training iterations, also as 10k.  [default: 200 a train photo, 7000 to 30000]",
+        help="Training iterations, also as 10k.  [default: 200 per train photo, 7000 to 30000]",
     ),
     device_option("auto: the GPU if torch and gsplat can use one, else the CPU."),
     threads_option,

@@ -35,7 +35,7 @@ from ambiguous_wild.harness.chosen_effects import (
 )
 from ambiguous_wild.harness.effects_plan import EffectsPlan, plan_effects
 from ambiguous_wild.harness.start import start_file, start_line, with_start
-from ambiguous_wild.harness.timing import MAX_RATIO, MIN_RATIO, expected_s, slowness
+from ambiguous_wild.harness.timing import MAX_RATIO, MIN_RATIO, expected_s, seconds_range, slowness
 from ambiguous_wild.io.files import check_output
 from ambiguous_wild.io.scene_folder import ALL_TRAINED, load_scene
 from ambiguous_wild.methods.registry import MethodEntry, get_method
@@ -313,8 +313,7 @@ def expected_time_line(cells: Sequence[Cell]) -> str:
         pixels = camera.width * camera.height
         gaussians = min(cell.train.max_gaussians or pixels, pixels)
         total += expected_s(cell.train.iterations, pixels, gaussians) * slower
-    lengths = sorted({cell.train.iterations for cell in cells})
-    length = " to ".join(str(n) for n in dict.fromkeys((lengths[0], lengths[-1])))
+    length = seconds_range([cell.train.iterations for cell in cells])
     return (
         f"no --iterations and no --budget: {counted(len(cells), 'run')} of {length} iterations take "
         f"{_duration(MIN_RATIO * total)} to {_duration(MAX_RATIO * total)} with 3dgs on this machine, "

@@ -57,7 +57,7 @@ def timing_of(cost: Cost) -> Timing:
 
 
 def seconds_range(values: Sequence[float], digits: int = 0) -> str:
-    """Return times as a range, "129 to 230", or one number where they print alike; empty without any."""
+    """Return numbers as a range, "129 to 230", or one number where they print alike; empty without any."""
     finite = [v for v in values if math.isfinite(v)]
     if not finite:
         return ""

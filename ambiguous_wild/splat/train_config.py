@@ -15,7 +15,7 @@ OnNonFinite = Literal["stop", "rollback"]
 def default_iterations(photos: int) -> int:
     """Return the default length of a run on a scene with this number of train photos.
 
-    Few photos are overfitted by as many iterations as hundreds need (docs/training.md).
+    Long runs overfit few photos (docs/training.md).
     """
     return min(max(PER_PHOTO * photos, SHORTEST), NOMINAL_ITERATIONS)
 
